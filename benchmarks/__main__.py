@@ -132,10 +132,7 @@ def bound(
     whole = alone = steps = float("inf")
     for _ in range(8):
         whole = min(whole, best_time(lambda: drives.advance(cycles * 1e-3), 1))
-        alone = min(
-            alone,
-            best_time(lambda: run_alone(drives.inside.records, groups[0].rates, cycles), 1),
-        )
+        alone = min(alone, best_time(lambda: run_alone(drives.inside.records, groups[0].rates, cycles), 1))
         kept = [(group.load.data.qpos.copy(), group.load.data.qvel.copy()) for group in groups]
         for group, (qpos, qvel) in zip(groups, moving, strict=True):
             # Forces of the last step would drive it away, and springs are not MuJoCo's.

@@ -7,10 +7,7 @@ from importlib.util import find_spec
 from typing import Any
 
 # Environment, section of its hyper-parameters (None for the environment's own), rollouts.
-TRAININGS = (
-    ("ServoDrive/Tracking-v0", "two_mass", 8),
-    ("ServoDrive/GainTuning-v0", None, 3),
-)
+TRAININGS = (("ServoDrive/Tracking-v0", "two_mass", 8), ("ServoDrive/GainTuning-v0", None, 3))
 CORES = 2
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from mechanics.bundle import Bundle
+from mechanics.kernels.bundle import Bundle
 
 State = dict[str, Any]
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from mechanics.compiled import inlined, stage
+from mechanics.kernels.compiled import inlined, stage
 
 # Damping ratio of the bristles: LuGre's canonical s_1 = sqrt(s_0) with a mass of 1 kg.
 BRISTLE_DAMPING = 0.5
@@ -94,31 +94,13 @@ def limited_torque(v, other, J, h, dry, viscous, drag):
 
 
 @stage
-def friction_torque(v, other, J, h, coulomb, breakaway, stribeck, viscous, drag):
-    """Return the friction torque [N*m] of one step by the static law.
-
-    Args:
-        v: Speed at the step's start [rad/s].
-        other: All other torque on this motion [N*m].
-        J: Inertia of this motion [kg*m^2].
-        h: Step [s].
-        coulomb: Sliding friction F_c [N*m].
-        breakaway: Friction at standstill F_s [N*m].
-        stribeck: Speed v_s over which it falls to F_c [rad/s].
-        viscous: Coefficient b [N*m*s/rad].
-        drag: Coefficient c [N*m*s^2/rad^2].
-    """
-    dry = dry_friction(middle_speed(v, other, J, h), coulomb, breakaway, stribeck)
-    return limited_torque(v, other, J, h, dry, viscous, drag)
-
-
-@stage
 def bristle_torque(v, other, J, h, z, s_0, s_1, coulomb, breakaway, stribeck, viscous, drag):
     """Return LuGre's friction torque [N*m] of one step, and the bristles' deflection [rad] at its end.
 
     The step's mean speed u solves u = v + h/2J (other + F(u)); at that speed the bristles relax towards z_ss
     exponentially, which is taken exactly, so that neither stiff bristles nor high speeds are unstable. `s_0`
-    [N*m/rad] and `s_1` [N*m*s/rad] are the bristles' stiffness and damping; the others as in `friction_torque`.
+    [N*m/rad] and `s_1` [N*m*s/rad] are the bristles' stiffness and damping; the others as `dry_friction` and
+    `limited_torque` have them.
     """
     half = 0.5 * h / J
     free = v + half * other

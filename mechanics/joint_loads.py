@@ -12,7 +12,7 @@ from mechanics.arrays import Floats
 from mechanics.load import Load
 from mechanics.model import actuators_of, held_joints, read_any_model
 from mechanics.model_files import joints_without_travel
-from mechanics.near_names import did_you_mean
+from mechanics.reading.near_names import did_you_mean
 
 POSES = 512  # drawn, before the search from the best of them
 VALUES = 25  # of one joint, on each line of the search

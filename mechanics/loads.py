@@ -8,7 +8,7 @@ from pathlib import Path
 
 from mechanics.load import Combination, Contact, Friction, Load, Parameter, Roll, Switch
 from mechanics.model import MODELS, resolve
-from mechanics.near_names import did_you_mean
+from mechanics.reading.near_names import did_you_mean
 
 
 def _friction(element: str, unit: str = "rad", **bounds: tuple[float, float]) -> tuple[Parameter, ...]:
@@ -263,10 +263,7 @@ _ROWS = (
         joints=("left", "right"),
         gear=1.0 / _PULLEY,
         disturbance={"travel": 1.0, "yaw": 0.06},
-        frictions=(
-            _guide("left", _LEFT),
-            _guide("right", _RIGHT),
-        ),
+        frictions=(_guide("left", _LEFT), _guide("right", _RIGHT)),
         parameters=(
             Parameter("mass", "kg", "body_mass", "bridge", 0.5, 3.0, "of the bridge"),
             Parameter("payload", "kg", "body_mass", "tool", 0.3, 3.0, "of the tool, 60 mm off the middle"),
@@ -318,10 +315,7 @@ _ROWS = (
             Friction(joint, {joint: 1.0}, 2e-3 * gear, 3e-3 * gear, 0.05, 1e-4 * gear, bristle=1e-4)
             for joint, gear in zip(_ROBOT_JOINTS, (80.0, 80.0, 50.0, 10.0, 15.0, 8.0), strict=True)
         ),
-        parameters=(
-            Parameter("payload", "kg", "body_mass", "tool", 0.2, 2.0, "of the tool"),
-            *_friction("shoulder"),
-        ),
+        parameters=(Parameter("payload", "kg", "body_mass", "tool", 0.2, 2.0, "of the tool"), *_friction("shoulder")),
         meaning="a table-top arm with six joints under gravity: six drives",
         energy_bound=1e-3,
         travel=_ROBOT_TRAVEL,

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from mechanics import native
-from mechanics.compiled import stage
+from mechanics.kernels import native
+from mechanics.kernels.compiled import stage
 
 
 @stage

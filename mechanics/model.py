@@ -17,9 +17,9 @@ import mujoco
 import numpy as np
 
 from mechanics.arrays import Floats
-from mechanics.limited_child import call_limited
 from mechanics.load import Combination, Friction, Load
 from mechanics.model_files import hash_of_model
+from mechanics.reading.limited_child import call_limited
 
 MODELS = Path(__file__).parent / "models"  # ours
 # Copies in one model. mj_step per copy: 1154 ns alone, 318 in 8, 204 in 64, 199 in 128 (two-mass shaft); a multiple of

@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from mechanics.untrusted import MOST_RECORDING, UntrustedFileError, read_bytes
+from mechanics.reading.untrusted import MOST_RECORDING, UntrustedFileError, read_bytes
 
 MOST_FILES = 1000  # of a model
 MOST_FOLDERS = 20  # that it names

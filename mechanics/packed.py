@@ -149,11 +149,7 @@ class PackedLoad:
 
         ValueError leaves all as it was.
         """
-        if np.any(armature <= 0.0) or np.any(friction < 0.0):
-            raise ValueError(
-                f"rotor inertia must be above 0 and friction not negative; the least are {armature.min():g} kg*m^2 "
-                f"and {friction.min():g}"
-            )
+        _check_motors(armature, friction)
         before = self.values.armature.copy()
         self.values.armature[:] = armature
         try:
@@ -170,11 +166,7 @@ class PackedLoad:
 
         ValueError leaves all as it was.
         """
-        if np.any(armature <= 0.0) or np.any(friction < 0.0):
-            raise ValueError(
-                f"rotor inertia must be above 0 and friction not negative; the least are {armature.min():g} kg*m^2 "
-                f"and {friction.min():g}"
-            )
+        _check_motors(armature, friction)
         before = {name: self.get(name) for name in parameters}
         motors = self.values.armature.copy(), self.values.motor_friction.copy()
         changed = where | np.any(armature != motors[0], axis=1) | np.any(friction != motors[1], axis=(1, 2))
@@ -434,6 +426,14 @@ class PackedLoad:
             self.plant.roll_armature[:, k] = armature[:, dof]
             start, core, _, density = self.values.roll[:, k].T
             armature[:, dof] += 0.5 * np.pi * density * (np.maximum(start, core) ** 4 - core**4)
+
+
+def _check_motors(armature: Floats, friction: Floats) -> None:
+    if np.any(armature <= 0.0) or np.any(friction < 0.0):
+        raise ValueError(
+            f"rotor inertia must be above 0 and friction not negative; the least are {armature.min():g} kg*m^2 "
+            f"and {friction.min():g}"
+        )
 
 
 def _copies_last(array: Floats) -> Floats:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from mechanics.bundle import Bundle, Cube, Matrix, NumberMatrix, Numbers, Vector
+from mechanics.kernels.bundle import Bundle, Cube, Matrix, NumberMatrix, Numbers, Vector
 
 
 @dataclass(eq=False)

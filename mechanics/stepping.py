@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from mechanics import native
-from mechanics.compiled import inlined, stage
 from mechanics.friction import bristle_torque, dry_friction, limited_torque, middle_speed
+from mechanics.kernels import native
+from mechanics.kernels.compiled import inlined, stage
 from mechanics.looking import look
 
 # Speed that rounding leaves of a motion that friction holds, as a share of what the break-away torque could give.
@@ -31,6 +31,32 @@ def add_product(total, i, factor, rows, k):
     if factor != 0.0:
         for copy in range(total.shape[1]):
             total[i, copy] += factor * rows[k, copy]
+
+
+@stage
+def see_motion(lane, v, other, motion, share, e, speed, total):
+    """Write into rows `v` and `other` of `lane` the speed of motion e and the force on it."""
+    D, copies = speed.shape
+    for copy in range(copies):
+        lane[v, copy] = 0.0
+        lane[other, copy] = 0.0
+    for d in range(D):
+        add_product(lane, v, motion[e, d], speed, d)
+        for copy in range(copies):
+            lane[other, copy] += share[e, d, copy] * total[d, copy]
+
+
+@stage
+def see_axis(lane, turned, axis_motion, a, share, e):
+    """Write into row `turned` of `lane` what motion e has of a torque of axis a."""
+    D, copies = axis_motion.shape[1], lane.shape[1]
+    for copy in range(copies):
+        lane[turned, copy] = 0.0
+    for d in range(D):
+        factor = axis_motion[a, d]
+        if factor != 0.0:
+            for copy in range(copies):
+                lane[turned, copy] += share[e, d, copy] * factor
 
 
 @stage
@@ -169,23 +195,11 @@ def press(plant, moment, h):
             carried[copy, b] = 0.0
         if touching == 0:
             continue
-        for copy in range(copies):
-            lane[v, copy] = 0.0
-            lane[other, copy] = 0.0
-        for d in range(D):
-            add_product(lane, v, motion[e, d], speed, d)
-            for copy in range(copies):
-                lane[other, copy] += share[e, d, copy] * total[d, copy]
+        see_motion(lane, v, other, motion, share, e, speed, total)
         for copy in range(copies):
             lane[correction, copy] = contact[b, 4, copy] * lane[other, copy]
         for a in range(A):
-            for copy in range(copies):
-                lane[turned, copy] = 0.0
-            for d in range(D):
-                factor = axis_motion[a, d]
-                if factor != 0.0:
-                    for copy in range(copies):
-                        lane[turned, copy] += share[e, d, copy] * factor
+            see_axis(lane, turned, axis_motion, a, share, e)
             for copy in range(copies):
                 lane[correction, copy] += contact[b, 5, copy] * lane[turned, copy] * moment[copy * A + a]
         for copy in range(copies):
@@ -223,15 +237,10 @@ def rub(plant, h):
         for d in range(D):
             add_product(total, d, motion[f, d], holding, f)
     for f in range(F):
-        for copy in range(copies):
-            lane[v, copy] = 0.0
-            lane[other, copy] = 0.0
-        for d in range(D):
-            if f > 0:
+        if f > 0:
+            for d in range(D):
                 add_product(total, d, -motion[f, d], holding, f)
-            add_product(lane, v, motion[f, d], speed, d)
-            for copy in range(copies):
-                lane[other, copy] += share[f, d, copy] * total[d, copy]
+        see_motion(lane, v, other, motion, share, f, speed, total)
         for copy in range(copies):
             if not abs(h * lane[other, copy]) < SPEED_LIMIT * mass[f, copy]:
                 # Seen before MuJoCo sees it: its own check would write a log file.
@@ -401,13 +410,7 @@ def report_contacts(plant, back, theta):
             # By this copy's own force: what other copies touch must change nothing here.
             lane[pressed, copy] = deep if carried[copy, b] != 0.0 else 0.0
         for a in range(A):
-            for copy in range(copies):
-                lane[turned, copy] = 0.0
-            for d in range(D):
-                factor = axis_motion[a, d]
-                if factor != 0.0:
-                    for copy in range(copies):
-                        lane[turned, copy] += share[e, d, copy] * factor
+            see_axis(lane, turned, axis_motion, a, share, e)
             for copy in range(copies):
                 theta[copy * A + a] -= contact[b, 6, copy] * lane[turned, copy] * lane[pressed, copy]
 

@@ -17,7 +17,7 @@ from mechanics.friction import FrictionModel
 from mechanics.load import Combination, Friction, Load
 from mechanics.load_values import body_numbers, check_places
 from mechanics.model import compile_packed, is_constant, is_constrained, is_varying, motion_of, read_model
-from mechanics.untrusted import read_bytes
+from mechanics.reading.untrusted import read_bytes
 
 _INDICES = Integers
 _MOST_TEMPLATES = 32  # one of 64 copies takes about 6 MB

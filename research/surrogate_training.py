@@ -32,7 +32,7 @@ from drive_env.devices import find_device
 from drive_env.envs.gain_tuning import GainTuning, GainTuningConfig
 from drive_env.loops.dynamics import DEFAULT, find_dynamics
 from drive_env.trials.score import TRIP
-from mechanics.untrusted import read_arrays
+from mechanics.reading.untrusted import read_arrays
 from research.tuner_recipes import RECIPES, Recipe, TrainingMachines, laws
 from tuning.bootstrap import bootstrap_interval
 

@@ -33,16 +33,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 
 import numpy as np
-from rigs.fault_injection import (
-    ANSWER,
-    EXPECTED,
-    ON,
-    RADIANS,
-    TURN,
-    ObservedWorld,
-    WorldBus,
-    eds_read_once,
-)
+from rigs.fault_injection import ANSWER, EXPECTED, ON, RADIANS, TURN, ObservedWorld, WorldBus, eds_read_once
 
 from drive_env import CanDrives, EmulatedDrives, Limits, SafetyError, cia402, motion
 from drive_env.canopen.frames import Frame

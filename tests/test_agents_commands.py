@@ -81,10 +81,7 @@ def test_a_search_on_processes_is_the_same_search(tmp_path, shrunk):
     ("arguments", "message"),
     [
         (("train", "walking"), "there is no environment 'walking'"),
-        (
-            ("train", "tracking", "-a", "dqn"),
-            "there is no algorithm 'dqn'; there are ppo, sac, recurrent_ppo,",
-        ),
+        (("train", "tracking", "-a", "dqn"), "there is no algorithm 'dqn'; there are ppo, sac, recurrent_ppo,"),
         (("train", "tracking", "--preset", "slow"), "there is no preset 'slow'"),
         (("train", "tracking", "--steps", "0"), "--steps 0 must be 1 or more"),
         (("train", "tracking", "--config", "no.yaml"), "there is no file no.yaml"),

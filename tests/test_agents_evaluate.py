@@ -487,10 +487,7 @@ def test_a_recorded_move_says_how_far_the_emulator_lies_from_it(tmp_path):
     ("arguments", "message"),
     [
         (("nowhere.npz",), "there is no file nowhere.npz"),
-        (
-            ("agent.tflite",),
-            "or a baseline (cascade, expert, feed_forward, nothing, oracle, rest, ",
-        ),
+        (("agent.tflite",), "or a baseline (cascade, expert, feed_forward, nothing, oracle, rest, "),
         (("feed_forward", "-e", "tracking"), "adds to the profile, and action is 'direct'"),
         (("state_feedback", "-e", "tracking"), "is for load inverted_pendulum, mode cst and action direct alone"),
         (("nowhere:policy",), "module 'nowhere' cannot be imported"),
@@ -522,8 +519,7 @@ def test_a_mistake_is_told_in_one_line(arguments, message):
 
 
 @pytest.mark.parametrize(
-    ("spec", "environment"),
-    [("test_agents_evaluate:gentle", "tracking"), ("test_agents_evaluate:Gentle", "tracking")],
+    ("spec", "environment"), [("test_agents_evaluate:gentle", "tracking"), ("test_agents_evaluate:Gentle", "tracking")]
 )
 def test_python_functions_and_classes_are_policies(spec, environment, tmp_path):
     config = tmp_path / "tracking.toml"

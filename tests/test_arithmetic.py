@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from drive_env.firmware.common import arithmetic
-from mechanics.compiled import cached
+from mechanics.kernels.compiled import cached
 
 ROUNDING = 1.2e-16  # of the reference, relative to a value of 1
 

@@ -9,20 +9,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from rigs.auto_stages import designs
-from rigs.known_machines import gains, open_machines, standing_in
+from rigs.chip_gains import Gains
+from rigs.known_machines import gains, open_machines, standing_in, true_plant
 from rigs.thinning import part
 from rigs.world_bus import served
 
 from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
-from drive_env.devices.gains import Gains, rule_gains
+from drive_env.devices.gains import rule_gains
 from drive_env.drives.observed import ObservedDrives
 from drive_env.drives.raw_gains import write_gains
 from drive_env.loops.dynamics import find_dynamics
 from drive_env.loops.linear_model import Plant
 from drive_env.loops.margins import margins
 from drive_env.loops.sampled import CascadeGains, LoopRates, closed_loops, open_loops, step_overshoot, window
-from drive_env.loops.true_plant import true_machines, true_plant
+from drive_env.loops.true_plant import true_machines
 from drive_env.motors import find_motor
 from drive_env.safety.envelope import SafetyError
 from drive_env.trials.positioning import plan_move
@@ -143,10 +144,7 @@ def test_gains_are_all_that_is_changed_and_the_drives_are_off(five):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("axis", "words"),
-    [(SHORT, "travel is too short: 0.008 rad (0.0013 turns), and 0.2 rad")],
-)
+@pytest.mark.parametrize(("axis", "words"), [(SHORT, "travel is too short: 0.008 rad (0.0013 turns), and 0.2 rad")])
 def test_what_cannot_be_tuned_gets_its_gains_back_and_the_reason_is_named(five, axis, words):
     _, result, before, after, _ = five
     assert not result.axes[axis].accepted

@@ -7,13 +7,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from rigs.auto_stages import basis, recorded
+from rigs.known_machines import true_plant
 
 from drive_env.devices import find_device
 from drive_env.devices.gains import cascade_columns, rule_gains
 from drive_env.drives.raw_gains import write_gains
 from drive_env.loops.dynamics import find_dynamics
 from drive_env.loops.sampled import CascadeGains, LoopRates, closed_loops, step_overshoot, window
-from drive_env.loops.true_plant import true_machines, true_plant
+from drive_env.loops.true_plant import true_machines
 from drive_env.safety.envelope import SafetyError
 from tuning.auto import correction, design
 from tuning.auto.bench import Journal

@@ -9,11 +9,11 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from rigs.known_machines import true_plant
 
 from drive_env.devices import find_device
 from drive_env.devices.gains import cascade_columns
 from drive_env.loops.dynamics import find_dynamics
-from drive_env.loops.true_plant import true_plant
 from drive_env.motors import find_motor
 from tuning.auto import design as module
 from tuning.auto.design import LEAST_TORQUE, Judge, _around, _of_each, design

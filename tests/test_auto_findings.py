@@ -6,12 +6,12 @@ from contextlib import closing
 
 import numpy as np
 import pytest
+from rigs.chip_gains import Gains
+from rigs.known_machines import true_plant
 
 from drive_env import cia402, motion
-from drive_env.devices.gains import Gains
 from drive_env.drives.currents import ampere_per_count
 from drive_env.drives.raw_gains import write_gains
-from drive_env.loops.true_plant import true_plant
 from drive_env.trials.positioning import plan_move
 from drive_env.trials.score import RobustScore
 from tuning.auto.one_button import BUDGET, Method, auto

@@ -8,13 +8,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from rigs.auto_stages import basis, recorded
+from rigs.known_machines import true_plant
 
 from drive_env import cia402, motion
 from drive_env.drives.raw_gains import write_gains
 from drive_env.loops.dynamics import find_dynamics
 from drive_env.loops.linear_model import OPEN_LOOPS
 from drive_env.loops.margins import Margins, margins
-from drive_env.loops.true_plant import true_plant
 from tuning.auto import loop_margins as auto_margins
 from tuning.auto.bench import AutoBench, Journal
 from tuning.auto.loop_model import loop_models

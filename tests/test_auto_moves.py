@@ -8,15 +8,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from rigs.auto_stages import basis, designs, recorded, short_designs
-from rigs.known_machines import gains, standing_in
+from rigs.chip_gains import Gains
+from rigs.known_machines import gains, standing_in, true_plant
 
 from drive_env import cia402, motion
-from drive_env.devices.gains import Gains, Rule, rule_gains
+from drive_env.devices.gains import Rule, rule_gains
 from drive_env.drives.raw_gains import write_gains
 from drive_env.fieldbus.link import Timing
 from drive_env.loops.dynamics import find_dynamics
 from drive_env.loops.linear_model import Plant
-from drive_env.loops.true_plant import true_plant
 from drive_env.safety.envelope import SafetyError
 from drive_env.trials.positioning import WATCH
 from tuning.auto import correction

@@ -9,8 +9,8 @@ import pytest
 
 from drive_env import EmulatedDrives, ObjectAccessError, motion
 from drive_env.emulator.cyclic_control import CyclicControl, Hooks, cyclic_control
-from mechanics.bundle import Bundle, Cube, Matrix, Numbers, Vector, reader
-from mechanics.compiled import cached
+from mechanics.kernels.bundle import Bundle, Cube, Matrix, Numbers, Vector, reader
+from mechanics.kernels.compiled import cached
 
 SAMPLED = (0x6041, 0x6064, 0x606C)
 

@@ -240,9 +240,9 @@ def test_what_a_killed_save_left_behind_does_not_matter(tmp_path, drives):
 # The child loads store.py alone: a start that takes 30 ms leaves time for 200.
 CHILD = """
 import importlib.util, json, os, sys, types
-reader = types.ModuleType("mechanics.untrusted")  # which needs NumPy; the parent reads with the real one
+reader = types.ModuleType("mechanics.reading.untrusted")  # which needs NumPy; the parent reads with the real one
 reader.read_json = lambda path: json.loads(path.read_text(encoding="utf-8"))
-sys.modules |= {"mechanics": types.ModuleType("mechanics"), "mechanics.untrusted": reader}
+sys.modules |= {"mechanics": types.ModuleType("mechanics"), "mechanics.reading.untrusted": reader}
 spec = importlib.util.spec_from_file_location("store", sys.argv[1])
 store = importlib.util.module_from_spec(spec)
 sys.modules["store"] = store

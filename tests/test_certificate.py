@@ -15,10 +15,11 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 from matplotlib.image import imread
+from rigs.chip_gains import Gains, bandwidths_from_gains
 from typer.testing import CliRunner
 
 from drive_env.devices import find_device
-from drive_env.devices.gains import Gains, bandwidths_from_gains, gains_in_si
+from drive_env.devices.gains import gains_in_si
 from drive_env.loops.margins import Margins, margins
 from drive_env.motors import find_motor
 from tuning.certificate.certificate import (
@@ -39,7 +40,7 @@ from tuning.certificate.certificate import (
     identified,
     si_gains,
 )
-from tuning.certificate.certificate_files import is_unchanged, load_certificate, save_certificate
+from tuning.certificate.certificate_files import certificate_files, is_unchanged, load_certificate
 from tuning.certificate.certificate_pictures import AFTER, BEFORE, DOUBTFUL, bode_picture, step_picture
 from tuning.certificate.report import to_html
 from tuning.commands.cli import app
@@ -107,7 +108,8 @@ def certificate():
 
 # --- the file -----------------------------------------------------------------------------------------------------
 def test_a_certificate_reads_back_to_the_last_digit(certificate, tmp_path):
-    path, _ = save_certificate(certificate, tmp_path / "run")
+    with certificate_files(certificate, tmp_path / "run") as (path, _):
+        pass
     found, unchanged = load_certificate(path)
     assert unchanged
     assert found.to_json() == certificate.to_json()
@@ -193,8 +195,8 @@ def verify(path):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["certificate.json", "report.html"])
 def test_verify_tells_by_its_exit_code_whether_a_file_was_changed(certificate, tmp_path, name):
-    save_certificate(certificate, tmp_path)
-    path = tmp_path / name
+    with certificate_files(certificate, tmp_path):
+        path = tmp_path / name
     done = verify(path)
     assert (done.exit_code, done.stdout) == (0, f"{path} is unchanged\n")
     told = CliRunner().invoke(app, ["verify", str(path), "--json"])

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from rigs.auto_stages import recorded
+from rigs.known_machines import true_plant
 
 from drive_env.devices import find_device
 from drive_env.drives.raw_gains import write_gains
@@ -15,20 +16,12 @@ from drive_env.loops.dynamics import find_dynamics
 from drive_env.loops.linear_model import OPEN_LOOPS
 from drive_env.loops.margins import Margins, margins
 from drive_env.loops.sampled import CascadeGains, LoopRates, open_loops
-from drive_env.loops.true_plant import true_machines, true_plant
+from drive_env.loops.true_plant import true_machines
 from tuning.auto.bench import Journal
 from tuning.auto.certify import certificate, requirements
 from tuning.auto.measured_margins import MeasuredAxis
 from tuning.auto.result import AxisResult, Result, collect
-from tuning.certificate.certificate import (
-    CROSSOVERS,
-    KEPT,
-    NEARLY_KEPT,
-    NOT_KEPT,
-    NOT_MEASURED,
-    SEEN_KEPT,
-    TAKEN,
-)
+from tuning.certificate.certificate import CROSSOVERS, KEPT, NEARLY_KEPT, NOT_KEPT, NOT_MEASURED, SEEN_KEPT, TAKEN
 from tuning.response import frequency_response
 from tuning.response.measured_loop import AtLeast
 from tuning.target import emulated

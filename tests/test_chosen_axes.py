@@ -107,16 +107,7 @@ def test_axes_without_a_motor_are_named_before_anything_moves(served, tmp_path, 
     assert (drives.read(cia402.STATUSWORD) & 0x4F == 0x40).all()
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
-        ("auto",),
-        ("auto", "--by", "tpe"),
-        ("identify",),
-        ("response",),
-        ("rules",),
-    ],
-)
+@pytest.mark.parametrize("command", [("auto",), ("auto", "--by", "tpe"), ("identify",), ("response",), ("rules",)])
 def test_an_axis_that_is_not_there_names_which_there_are(command, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     done = drive_tune(*command, "--device", "tmcm6212", "--node", "1", "--travel", "free", "--yes", "--axis", "6")

@@ -13,6 +13,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from rigs.known_machines import true_plant
 from rigs.truth import settings_of
 from typer.testing import CliRunner
 
@@ -24,7 +25,6 @@ from drive_env.canopen.frames import SDO_REQUEST
 from drive_env.drives.raw_gains import write_gains
 from drive_env.loops.linear_model import OPEN_LOOPS
 from drive_env.loops.margins import margins
-from drive_env.loops.true_plant import true_plant
 from tuning.commands.cli import app
 from tuning.commissioning.bench import CommissioningPlan
 from tuning.commissioning.path import CommissioningPath

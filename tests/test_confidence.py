@@ -14,8 +14,7 @@ DEVICE = SimpleNamespace(stage={"adc_gain_error_a": SimpleNamespace(low=-WORST, 
 
 
 @pytest.mark.parametrize(
-    ("kind", "turns", "channels"),
-    [("pmsm", True, 2), ("pmsm", False, 1), ("dc", True, 1), ("dc", False, 1)],
+    ("kind", "turns", "channels"), [("pmsm", True, 2), ("pmsm", False, 1), ("dc", True, 1), ("dc", False, 1)]
 )
 def test_the_gain_error_of_a_current_covers_95_percent_of_the_sensors(kind, turns, channels):
     """Each channel is anywhere within its limits; a turning field averages two."""

@@ -13,7 +13,7 @@ from drive_env.firmware import cycle
 from drive_env.firmware.record import LANES, get_lanes
 from drive_env.firmware.servo.stages import FIRMWARE
 from drive_env.trials import response
-from mechanics.compiled import cached
+from mechanics.kernels.compiled import cached
 from mechanics.loads import LOADS
 from mechanics.packed import PackedLoad
 

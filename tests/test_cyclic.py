@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from rigs.truth import field
 
 from drive_env import EmulatedDrives, cia402, motion
-from drive_env.firmware.record import get_lanes
 
 TURN = 65536  # increments
 FOLLOWS, REACHED, LIMITED, FOLLOWING_ERROR = 0x1000, 0x0400, 0x0800, 0x2000  # statusword bits 12, 10, 11, 13
@@ -52,10 +52,6 @@ def feed(drives, name, points, period, objects):
         drives.write(name, point)
         traces.append(drives.record(objects, period / 1000))
     return {key: np.concatenate([trace[key] for trace in traces]) for key in objects}
-
-
-def field(drives, name):
-    return get_lanes(drives.inside.records, name, drives.num_axes).astype(float)
 
 
 def prepare(drives, mode, period=1):

@@ -9,7 +9,7 @@ import pytest
 from drive_env.devices import FOLDER, device_names, find_device
 from drive_env.devices.commissioning import RULES, preset
 from drive_env.devices.variants import DEFAULTS, FAMILIES, device_data, merged
-from mechanics.untrusted import read_toml
+from mechanics.reading.untrusted import read_toml
 
 
 def leaves(table, path=()):

@@ -298,8 +298,7 @@ MAPPINGS = [*range(0x1600, 0x1604), *range(0x1A00, 0x1A04)]
 
 
 @every_row(
-    ("index", "sub", "name", "data_type", "access", "low", "high", "default", "unit", "mappable", "table"),
-    ENTRIES,
+    ("index", "sub", "name", "data_type", "access", "low", "high", "default", "unit", "mappable", "table"), ENTRIES
 )
 def test_entry_is_as_in_the_manual(index, sub, name, data_type, access, low, high, default, unit, mappable, table):
     found = entry(OD, index, sub)

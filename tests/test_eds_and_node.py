@@ -12,13 +12,7 @@ from rigs.canopen_wire import Wire
 
 from drive_env import EmulatedDrives
 from drive_env.devices import find_device
-from drive_env.dictionary.aborts import (
-    CANNOT_BE_STORED,
-    READ_ONLY,
-    VALUE_RANGE,
-    VALUE_TOO_HIGH,
-    VALUE_TOO_LOW,
-)
+from drive_env.dictionary.aborts import CANNOT_BE_STORED, READ_ONLY, VALUE_RANGE, VALUE_TOO_HIGH, VALUE_TOO_LOW
 from drive_env.dictionary.entries import eds_text
 
 DEVICES = ("tmcm1636", "tmcm1636_fw109", "tmcm3313", "tmcm6212", "tgz_d")

@@ -16,7 +16,7 @@ from drive_env.dictionary.eds_file import parse_eds
 from drive_env.dictionary.eds_values import node_id_sum, number_of
 from drive_env.dictionary.entries import ObjectDictionary, eds_file, read_eds
 from drive_env.fieldbus.description import describe
-from mechanics.untrusted import UntrustedFileError
+from mechanics.reading.untrusted import UntrustedFileError
 
 SHIPPED = sorted((Path(__file__).parents[1] / "drive_env" / "devices").glob("*/*.eds"))
 HEAD = "[FileInfo]\nFileName=a.eds\n"

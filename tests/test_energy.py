@@ -20,7 +20,7 @@ from drive_env.firmware.record import LANES, get_lanes, set_lanes
 from drive_env.firmware.servo.stages import FIRMWARE
 from drive_env.firmware.servo.thermal import warm
 from drive_env.motors import MOTORS, motors_of
-from mechanics.compiled import cached
+from mechanics.kernels.compiled import cached
 
 start_window, supervise, tick = FIRMWARE.start_window, FIRMWARE.supervise, FIRMWARE.tick
 

@@ -50,10 +50,7 @@ def test_where_the_ramp_is_not_known_a_stop_may_take_half_a_second_at_full_speed
     path = tmp_path / "without.eds"
     path.write_text(re.sub(r"\n\d+=0x60(84|85)\b", "", text), encoding="utf-8")
     drive.values[0x608F, 1], drive.values[0x608F, 2] = (TURN, 4), (1, 4)
-    with (
-        ScriptedBus(drive) as bus,
-        CanDrives(eds=path, bus=bus, pace="lockstep", safety=TRAVEL) as drives,
-    ):
+    with ScriptedBus(drive) as bus, CanDrives(eds=path, bus=bus, pace="lockstep", safety=TRAVEL) as drives:
         motion.enable(drives, mode="csv")
         drives.advance(0.03)
         drive.motion = lambda d: d.set(0x6064, d.get(0x6064) + turns * TURN // 1000)

@@ -81,10 +81,7 @@ def test_at_4_khz_in_lockstep_a_policy_acts_in_each_cycle(tmp_path):
     with EmulatedDrives(device, load="portal", num_threads=1) as inside:
         inside.advance(0.002)
         expected = policy(inside)
-    with (
-        EmulatedSegment(device) as segment,
-        EtherCatDrives(device, master=segment.master(), pace="lockstep") as drives,
-    ):
+    with EmulatedSegment(device) as segment, EtherCatDrives(device, master=segment.master(), pace="lockstep") as drives:
         np.testing.assert_array_equal(policy(drives), expected)
     assert (np.ptp(expected[:, 1], axis=0) > 50).all()
 

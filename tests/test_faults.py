@@ -82,10 +82,7 @@ def test_the_page_is_what_the_table_says():
 
 
 # --- what each does to the drive --------------------------------------------------------------------------------------
-SCENARIOS = {
-    "open_phase": {"friction": 0.04},
-    "supply_surge": {"load": "inertia"},
-}
+SCENARIOS = {"open_phase": {"friction": 0.04}, "supply_surge": {"load": "inertia"}}
 
 
 @pytest.mark.parametrize("name", WITH_EMERGENCY)

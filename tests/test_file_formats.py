@@ -40,7 +40,7 @@ from tuning.certificate.certificate import (
     StatedParameter,
     StepResponse,
 )
-from tuning.certificate.certificate_files import save_certificate
+from tuning.certificate.certificate_files import certificate_files
 from tuning.commands.cli import app
 from tuning.runs import inputs
 from tuning.snapshot import take
@@ -86,7 +86,8 @@ def certificate(tmp_path_factory):
     )  # fmt: skip
     made = Certificate("auto", "tmcm1636", "qbl4208", "belt", 24.0, 0, {}, (axis,), {})
     folder = tmp_path_factory.mktemp("certificate")
-    save_certificate(made, folder)
+    with certificate_files(made, folder):
+        pass
     return json.loads((folder / "certificate.json").read_text(encoding="utf-8"))
 
 

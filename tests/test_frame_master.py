@@ -16,7 +16,7 @@ from drive_env.ethercat import datagrams
 from drive_env.ethercat.application import AlState, AlStatusCode
 from drive_env.ethercat.datagrams import DatagramCommand, at_station
 from drive_env.fieldbus.errors import BusError, NoAnswerError
-from drive_env.master.ethercat import frame_master
+from drive_env.master.ethercat import frame_master, state_names
 from drive_env.master.ethercat.ethercat_master import ImageSizes, SlaveIdentity, SlaveStatus, Sync0
 from drive_env.master.ethercat.frame_master import FrameMaster
 
@@ -91,6 +91,7 @@ def master(way):
 def clock(monkeypatch):
     found = Clock()
     monkeypatch.setattr(frame_master, "time", found)
+    monkeypatch.setattr(state_names, "time", found)
     return found
 
 
@@ -597,7 +598,7 @@ def test_a_slave_whose_watchdog_was_quicker_than_a_busy_computer_is_asked_again(
 
 
 def test_op_that_does_not_come_in_time_is_told(way, master, clock, monkeypatch):
-    monkeypatch.setattr(frame_master, "LOOK", 0.5)
+    monkeypatch.setattr(state_names, "LOOK", 0.5)
     way.change = status_of((4, 0))
     with pytest.raises(BusError, match=r"^position 0 stays in Safe-Op and does not come to Op; it gives no reason$"):
         master.operate([0, 1], None, 1.0)

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from rigs.known_machines import true_plant
 from rigs.world_bus import served
 
 from drive_env import EmulatedDrives, cia402, motion
@@ -14,7 +15,6 @@ from drive_env.devices.gains import BASELINE_RULE, rule_gains
 from drive_env.drives.raw_gains import read_gains, write_gains
 from drive_env.loops.linear_model import Plant, position_open_loop, velocity_open_loop
 from drive_env.loops.margins import margins
-from drive_env.loops.true_plant import true_plant
 from drive_env.motors import find_motor
 from tuning.response import excitation_run
 from tuning.response.frequency_response import Signal, measure

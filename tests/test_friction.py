@@ -9,15 +9,16 @@ from hypothesis import strategies as st
 from rigs.stepped_load import stepped
 
 from mechanics import friction
-from mechanics.compiled import cached
+from mechanics.kernels.compiled import cached
 from mechanics.loads import LOADS
 from mechanics.packed import PackedLoad
 
 
 @cached()
 def friction_torque(v, other, inertia, h, coulomb, breakaway, stribeck, viscous, drag):
-    """The stage, for Python."""
-    return friction.friction_torque(v, other, inertia, h, coulomb, breakaway, stribeck, viscous, drag)
+    """The static law's torque of one step [N*m], of the parts that kernels put together."""
+    dry = friction.dry_friction(friction.middle_speed(v, other, inertia, h), coulomb, breakaway, stribeck)
+    return friction.limited_torque(v, other, inertia, h, dry, viscous, drag)
 
 
 H = 200e-6

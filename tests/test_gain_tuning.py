@@ -5,11 +5,12 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 import pytest
+from rigs.chip_gains import Gains
 from rigs.world_bus import served
 
 from drive_env import EmulatedDrives, Limits, cia402
 from drive_env.devices import find_device
-from drive_env.devices.gains import Gains, rule_gains, small_time_constants
+from drive_env.devices.gains import rule_gains, small_time_constants
 from drive_env.envs.gain_tuning import GainTuning
 from drive_env.trials import gain_trial
 from drive_env.trials.gain_trial import Trials, measured_cost, softness

@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 
 import pytest
-from rigs.chip_gains import chip_gains
+from rigs.chip_gains import Gains, bandwidths_from_gains, chip_gains
 
 from drive_env.devices import find_device
-from drive_env.devices.gains import Gains, bandwidths_from_gains
 from drive_env.motors import MOTORS
 
 DEVICE = find_device("tmcm1636")

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from rigs.known_machines import true_plant
 
-from drive_env.loops.true_plant import true_plant
 from mechanics import Load
 from tuning.identify.quick_identification import identify_briefly
 from tuning.target import emulated

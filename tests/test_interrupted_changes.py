@@ -91,10 +91,7 @@ def interrupted(bus, at):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("act", "safety"),
-    [(sample, False), pytest.param(move, LIMITS, marks=pytest.mark.slow)],
-)
+@pytest.mark.parametrize(("act", "safety"), [(sample, False), (move, LIMITS)])
 def test_ctrl_c_at_any_frame_leaves_nothing_lent(bus, act, safety):
     """15 of 499 frames left TPDOs switched off, remapped, or a heartbeat set, and the program said nothing of it."""
     before, at = held(bus), 0

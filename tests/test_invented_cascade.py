@@ -14,20 +14,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rigs.chip_gains import Gains, bandwidths_from_gains
+from rigs.known_machines import true_plant
 from typer.testing import CliRunner
 
 from agents.tuner.tune_target import surrogate
 from drive_env import motion
 from drive_env.devices import find_device
-from drive_env.devices.gains import (
-    Gains,
-    bandwidth_gains,
-    bandwidths_from_gains,
-    check_linear_model,
-    gains_in_si,
-)
+from drive_env.devices.gains import bandwidth_gains, check_linear_model, gains_in_si
 from drive_env.loops.linear_model import OPEN_LOOPS, Plant
-from drive_env.loops.true_plant import true_plant
 from drive_env.motors import find_motor
 from tuning.auto.checks import unsafe_gains
 from tuning.auto.design import Judge, design

@@ -23,9 +23,9 @@ from drive_env.emulator.prepared_record import from_od
 from drive_env.envs import bus_delays, tracking_cycle
 from drive_env.firmware.servo import stages
 from drive_env.firmware.servo.stages import FIRMWARE
-from mechanics import kernel_files
-from mechanics.compiled import source_hash, sources, stage, user_cache_folder
-from mechanics.kernel_files import KernelFiles
+from mechanics.kernels import kernel_files
+from mechanics.kernels.compiled import source_hash, sources, stage, user_cache_folder
+from mechanics.kernels.kernel_files import KernelFiles
 
 ROOT = Path(kernel_files.__file__).parent.parent
 # What a program does with two small kernels, and how many it compiled.

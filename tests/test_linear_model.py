@@ -5,12 +5,13 @@ import math
 
 import numpy as np
 import pytest
-from rigs.chip_gains import chip_gains
+from rigs.chip_gains import Gains, chip_gains
+from rigs.known_machines import true_plant
 from scipy.linalg import expm
 
 from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
-from drive_env.devices.gains import Gains, gains_in_si
+from drive_env.devices.gains import gains_in_si
 from drive_env.drives.raw_gains import write_gains
 from drive_env.emulator.loop_trace import trace_loops
 from drive_env.loops.linear_model import (
@@ -26,7 +27,6 @@ from drive_env.loops.linear_model import (
     velocity_plant,
 )
 from drive_env.loops.sampled import exponential
-from drive_env.loops.true_plant import true_plant
 from drive_env.motors import find_motor
 from tuning.estimate import Estimate, refused
 from tuning.identify.identified_axis import Identification

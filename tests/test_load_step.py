@@ -6,9 +6,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from rigs.chip_gains import Gains
 
 from drive_env import motion
-from drive_env.devices.gains import Gains, gains_in_si
+from drive_env.devices.gains import gains_in_si
 from drive_env.drives.raw_gains import write_gains
 from mechanics.shaft import one, way
 from tuning.auto import load_step as module

@@ -7,13 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from rigs.known_machines import true_plant
 
 from drive_env.devices import find_device
 from drive_env.devices.gains import rule_gains
 from drive_env.loops.dynamics import OFF_NOMINAL, find_dynamics
 from drive_env.loops.linear_model import Plant
 from drive_env.loops.sampled import CascadeGains, LoopRates, open_loops
-from drive_env.loops.true_plant import linear_load, true_machines, true_plant
+from drive_env.loops.true_plant import linear_load, true_machines
 from drive_env.motors import find_motor
 from drive_env.trials.score import RobustScore
 from tuning.auto.loop_model import LinkedAxis, LoopModel, loop_models, one_axis, one_plant, two_ends

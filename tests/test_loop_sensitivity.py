@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from rigs.known_machines import true_plant
 from typer.testing import CliRunner
 
 from agents.commands.cli import app
@@ -13,7 +14,6 @@ from agents.policies.policy import policy_of
 from drive_env import EmulatedDrives
 from drive_env.loops.dynamics import find_dynamics
 from drive_env.loops.linear_model import position_open_loop, velocity_open_loop
-from drive_env.loops.true_plant import true_plant
 
 TRACKING = "ServoDrive/Tracking-v0"
 ERROR, SPEED = 0, 3  # entries of an axis' observation

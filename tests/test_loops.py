@@ -29,7 +29,7 @@ from drive_env.firmware.servo.power_stage import convert_energy, power_stage, re
 from drive_env.firmware.servo.sensors import measure_angle, measure_currents, measure_motion
 from drive_env.firmware.servo.stages import FIRMWARE
 from drive_env.motors import MOTORS
-from mechanics.compiled import OPTIONS, cached
+from mechanics.kernels.compiled import OPTIONS, cached
 
 window = FIRMWARE.window
 
@@ -650,14 +650,8 @@ def refresh_stage(drive, rates):
 
 # Packed and scalar double multiplications, additions, subtractions and their fused forms.
 INSTRUCTIONS = {
-    "x86": (
-        r"\bv?(?:mul|add|sub)pd\b|\bvfn?m(?:add|sub)\d+pd\b",
-        r"\bv?(?:mul|add|sub)sd\b|\bvfn?m(?:add|sub)\d+sd\b",
-    ),
-    "arm": (
-        r"\bf(?:mul|add|sub|mla|mls)(?:\.2d\b|\s+v\d+\.2d)",
-        r"\bf(?:n?mul|add|sub|n?madd|n?msub)\s+d\d+",
-    ),
+    "x86": (r"\bv?(?:mul|add|sub)pd\b|\bvfn?m(?:add|sub)\d+pd\b", r"\bv?(?:mul|add|sub)sd\b|\bvfn?m(?:add|sub)\d+sd\b"),
+    "arm": (r"\bf(?:mul|add|sub|mla|mls)(?:\.2d\b|\s+v\d+\.2d)", r"\bf(?:n?mul|add|sub|n?madd|n?msub)\s+d\d+"),
 }
 
 

@@ -12,8 +12,8 @@ from scipy.integrate import solve_ivp
 
 from drive_env import EmulatedDrives
 from mechanics import friction as friction_laws
-from mechanics.compiled import cached
 from mechanics.friction import FRICTION_MODELS, find_friction
+from mechanics.kernels.compiled import cached
 from mechanics.loads import LOADS
 from mechanics.packed import PackedLoad
 from mechanics.stepping import step

@@ -14,7 +14,7 @@ from drive_env.firmware.cycle import Rates
 from drive_env.firmware.record import LANES
 from drive_env.firmware.servo.alignment import ENCODER
 from drive_env.firmware.servo_mains.stages import FIRMWARE, prepare_link
-from mechanics.compiled import cached
+from mechanics.kernels.compiled import cached
 
 start_window, tick = FIRMWARE.start_window, FIRMWARE.tick
 MOTOR = motors.MOTORS["am3041_e"]

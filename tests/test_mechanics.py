@@ -39,10 +39,7 @@ def machines(name, copies=1, h=H, bearing=(0.0, 0.0, 1.0, 0.0), integrator="leap
 
 def analytic(stiffness, J_load=J_L):
     """Return anti-resonance and resonance of two masses on a shaft [Hz]."""
-    return (
-        np.sqrt(stiffness / J_load) / (2 * np.pi),
-        np.sqrt(stiffness * (1 / MOTOR_SIDE + 1 / J_load)) / (2 * np.pi),
-    )
+    return (np.sqrt(stiffness / J_load) / (2 * np.pi), np.sqrt(stiffness * (1 / MOTOR_SIDE + 1 / J_load)) / (2 * np.pi))
 
 
 # --- inertia ----------------------------------------------------------------------------------------------------------

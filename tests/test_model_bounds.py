@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from rigs.known_machines import true_plant
 
 from drive_env.loops.linear_model import OPEN_LOOPS, Plant
 from drive_env.loops.margins import margins
-from drive_env.loops.true_plant import true_plant
 from tuning.auto.certify import certificate
 from tuning.auto.model_bounds import at_least_by_model, why_unbounded
 from tuning.auto.one_button import Method, auto

@@ -16,17 +16,7 @@ from rigs.safety_model.exploration import (
 )
 from rigs.safety_model.frames import transfers
 from rigs.safety_model.program import PLAYS, WORDS, program_steps
-from rigs.safety_model.rules import (
-    DISABLED,
-    ENABLE,
-    NO_POWER,
-    OURS,
-    OWN_ID,
-    SET_POINT,
-    SHUTDOWN,
-    TODAY,
-    Assumptions,
-)
+from rigs.safety_model.rules import DISABLED, ENABLE, NO_POWER, OURS, OWN_ID, SET_POINT, SHUTDOWN, TODAY, Assumptions
 from rigs.safety_model.situation import At, Hand, Held, Situation, StopStage
 from rigs.safety_model.steps import attended
 from rigs.safety_model.supervisor import supervisor_steps

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from drive_env.pictures.scene import load_model
-from mechanics import limited_child
 from mechanics.loads import LOADS, find_load
 from mechanics.model import compile_packed, read_model
-from mechanics.untrusted import UntrustedFileError
+from mechanics.reading import limited_child
+from mechanics.reading.untrusted import UntrustedFileError
 
 BODY = '<body name="arm"><joint name="axle" axis="0 0 1"/><geom name="rod" size="0.1" mass="1" {of}/></body>'
 MODEL = "<mujoco>{more}<worldbody>{inside}" + BODY + "</worldbody></mujoco>"

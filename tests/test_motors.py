@@ -14,7 +14,7 @@ from drive_env.devices import find_device
 from drive_env.devices.commissioning import preset as rule
 from drive_env.firmware.record import get_lanes, set_lanes
 from drive_env.motors import find_motor
-from mechanics.untrusted import read_toml
+from mechanics.reading.untrusted import read_toml
 
 DEVICE = find_device("tmcm1636")
 MOTORS = DEVICE.motors  # steppers: test_stepper_motors.py
@@ -157,10 +157,7 @@ def test_the_qube_servo_3_row_is_that_of_its_manual():
 
 @pytest.mark.parametrize(
     ("name", "R", "L", "K_t", "J"),
-    [
-        ("class_20w", 2.2, 0.45e-3, 0.022, 0.9e-6),
-        ("class_750w", 0.05, 0.1e-3, 0.11, 1.2e-4),
-    ],
+    [("class_20w", 2.2, 0.45e-3, 0.022, 0.9e-6), ("class_750w", 0.05, 0.1e-3, 0.11, 1.2e-4)],
 )
 def test_class_rows_are_those_of_the_gain_tables_columns(name, R, L, K_t, J):
     row = MOTORS[name]

@@ -602,9 +602,7 @@ def test_the_current_keeps_its_limit(emulated):
 # --- stops ---------------------------------------------------------------------------------------------------------
 @pytest.mark.every(4)
 @pytest.mark.parametrize(
-    "settings",
-    [{0x6085: 1}, {0x6085: 1, 0x605A: 6}],
-    ids=["deceleration of 1", "deceleration of 1 and stay"],
+    "settings", [{0x6085: 1}, {0x6085: 1, 0x605A: 6}], ids=["deceleration of 1", "deceleration of 1 and stay"]
 )
 @pytest.mark.parametrize("end", ["close", "trip"])
 def test_a_stop_does_not_depend_on_what_the_program_wrote(emulated, settings, end):

@@ -259,10 +259,7 @@ def test_inertia_and_friction_are_what_the_load_angle_says_at_the_run_current(mo
             first = 0.0 if not phases else angle[-1]
             phases.append(1)
             true = first + way * angle
-            rows = {
-                cia402.POSITION_ACTUAL: true - way * speed * age,
-                cia402.POSITION_DEMAND: true + way * lag,
-            }
+            rows = {cia402.POSITION_ACTUAL: true - way * speed * age, cia402.POSITION_DEMAND: true + way * lag}
             return {name: np.rint(rows[name] * to_increments).astype(np.int64)[:, None] for name in objects}
 
     monkeypatch.setattr(module, "device_of", lambda drives: STEPPER)
@@ -1025,12 +1022,7 @@ def test_what_a_trial_cannot_tell_apart_is_refused():
     none = SimpleNamespace(
         name="none",
         gains=SimpleNamespace(
-            outer=(),
-            columns=lambda names: (),
-            loop_of=lambda names: None,
-            closed_loops=(),
-            is_open_loop=False,
-            rows=(),
+            outer=(), columns=lambda names: (), loop_of=lambda names: None, closed_loops=(), is_open_loop=False, rows=()
         ),
     )
     with pytest.raises(ValueError, match="none has no gains of a velocity or position loop and no phase currents"):

@@ -137,10 +137,7 @@ def test_a_trial_with_too_little_current_loses_steps_is_stopped_and_the_next_one
 
 def test_an_encoder_that_shows_nothing_is_told_before_anything_is_scored(stepper):
     told = r"axis 0: the encoder showed 0 of \d+ increments .* not connected"
-    with (
-        target(stepper, parameters={"motor.encoder_broken": 1.0}) as found,
-        pytest.raises(RuntimeError, match=told),
-    ):
+    with target(stepper, parameters={"motor.encoder_broken": 1.0}) as found, pytest.raises(RuntimeError, match=told):
         TrialBench(found, anew=True).identify()
 
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from rigs.chip_gains import Gains
 from rigs.world_bus import served
 from typer.testing import CliRunner
 
@@ -16,7 +17,6 @@ from drive_env.bus.hub import Hub
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
 from drive_env.devices import find_device
-from drive_env.devices.gains import Gains
 from drive_env.drives.observed import ObservedDrives
 from drive_env.drives.raw_gains import write_gains
 from drive_env.motors import find_motor

@@ -76,10 +76,7 @@ def test_a_brushed_motor_has_one_winding():
         ),
         ({"torque_constant_rms": 0.1}, "torque_constant_peak and torque_constant_rms are two forms of the same number"),
         ({"torque_constant_peak": None}, "torque_constant_peak or .* is missing, or the rated current"),
-        (
-            {"resistance_ohm": 0.4, "resistance_phase_ohm": None},
-            "resistance_ohm: of a brushless motor say",
-        ),
+        ({"resistance_ohm": 0.4, "resistance_phase_ohm": None}, "resistance_ohm: of a brushless motor say"),
     ],
 )
 def test_a_wrong_number_is_told_with_the_remedy(change, message):
@@ -162,10 +159,7 @@ def test_a_motor_that_no_drive_of_ours_can_turn_is_told(tmp_path):
         (["own.txt", "--kind", "pmsm"], "must end with .toml"),
         (["own.toml", "--kind", "pmsm", "-n", "inertia_kg_m2=much"], "is not a number; write it as 4.8e-6"),
         (["own.toml", "--kind", "pmsm", "-n", "mass=1"], "'mass' is not a number of a motor.*--list shows them"),
-        (
-            ["own.toml", "--kind", "pmsm", "--source", "x"],
-            "resistance_.* is missing; give it with --number",
-        ),
+        (["own.toml", "--kind", "pmsm", "--source", "x"], "resistance_.* is missing; give it with --number"),
         (
             ["own.toml", "--kind", "pmsm", "--source", "x", *options({**FORMS[0], "pole_pairs": 4})],
             "inertia_kg_m2 is missing; .* take that of a motor of the same size",

@@ -14,7 +14,7 @@ from drive_env.firmware.record import LANES, get_lanes, set_lanes
 from drive_env.firmware.servo.derived import derive
 from drive_env.firmware.servo.power_stage import convert_energy, power_stage, refresh_winding
 from drive_env.firmware.servo.stages import FIRMWARE
-from mechanics.compiled import cached
+from mechanics.kernels.compiled import cached
 
 DT = 40e-6  # s, current loop
 WINDOW = 200e-6  # s, velocity loop

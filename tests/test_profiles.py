@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 
 from drive_env import EmulatedDrives, motion
 from drive_env.firmware.common import profiles
-from mechanics.compiled import cached
+from mechanics.kernels.compiled import cached
 
 DT = 1e-3
 

@@ -25,7 +25,7 @@ import tuning.commands.cli
 from drive_env.commands import compile_bar, compiling, progress
 from drive_env.commands.program import AGAIN, Quiet, RepeatedLines, Verbose, say_as_much
 from drive_env.commands.progress import progress_on
-from mechanics import kernel_files
+from mechanics.kernels import kernel_files
 
 APPS = {
     "drive-env": drive_env.commands.cli.app,

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from rigs.known_machines import true_plant
 
 from drive_env import cia402
 from drive_env.devices import find_device
@@ -16,7 +17,6 @@ from drive_env.drives.raw_gains import write_gains
 from drive_env.emulator.inertia_check import MisfitWarning
 from drive_env.loops.linear_model import Plant
 from drive_env.loops.margins import margins
-from drive_env.loops.true_plant import true_plant
 from drive_env.motors import find_motor
 from drive_env.trials.positioning import CYCLE
 from tuning.rules import relay as module

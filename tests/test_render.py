@@ -323,10 +323,7 @@ def test_mistakes_in_what_is_drawn_are_told(tmp_path):
                     "</body></worldbody></mujoco>")  # fmt: skip
     with pytest.raises(ValueError, match="no geom that can be seen"):
         Scene(path)
-    with (
-        Scene(LOADS["belt"].mjcf, 100, 100) as scene,
-        pytest.raises(ValueError, match="has 2 joint coordinates"),
-    ):
+    with Scene(LOADS["belt"].mjcf, 100, 100) as scene, pytest.raises(ValueError, match="has 2 joint coordinates"):
         scene.draw([0.0])
 
 

@@ -8,17 +8,18 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from rigs.chip_gains import Gains
+from rigs.known_machines import true_plant
 from scipy import signal
 
 from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
-from drive_env.devices.gains import RAW_MAX, Gains, gains_in_si
+from drive_env.devices.gains import RAW_MAX, gains_in_si
 from drive_env.drives.raw_gains import write_gains
 from drive_env.emulator.parameters import velocity_filter
 from drive_env.loops.dynamics import find_dynamics
 from drive_env.loops.linear_model import OPEN_LOOPS, Plant, current_open_loop, position_open_loop, velocity_open_loop
 from drive_env.loops.margins import Margins, margins
-from drive_env.loops.true_plant import true_plant
 from drive_env.motors import MOTORS, find_motor
 from tuning.compare import side_by_side
 from tuning.compare.side_by_side import outer_margins, slacks

@@ -18,15 +18,7 @@ from rigs.safety_model import drive as drive_model
 from rigs.safety_model.drive import Drive
 from rigs.safety_model.exploration import GIVEN_UP, LEFT, RUNS_ON, TAKEN_FOR_OFF, UNRAMPED, UNWATCHED, explore
 from rigs.safety_model.program import WORDS
-from rigs.safety_model.rules import (
-    NO_POWER,
-    OURS,
-    OWN_ID,
-    SET_POINT,
-    SHUTDOWN,
-    TODAY,
-    Assumptions,
-)
+from rigs.safety_model.rules import NO_POWER, OURS, OWN_ID, SET_POINT, SHUTDOWN, TODAY, Assumptions
 from rigs.safety_model.situation import At, beginnings
 from rigs.safety_model.steps import steps
 

@@ -8,22 +8,16 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from rigs.chip_gains import chip_gains
+from rigs.chip_gains import Gains, bandwidths_from_gains, chip_gains
+from rigs.known_machines import true_plant
 
 from drive_env import EmulatedDrives
 from drive_env.devices import find_device
-from drive_env.devices.gains import (
-    BASELINE_RULE,
-    Gains,
-    bandwidth_gains,
-    bandwidths_from_gains,
-    rule_gains,
-    small_time_constants,
-)
+from drive_env.devices.gains import BASELINE_RULE, bandwidth_gains, rule_gains, small_time_constants
 from drive_env.dictionary.roles import Role
 from drive_env.emulator.parameters import WIRING
 from drive_env.loops.dynamics import find_dynamics
-from drive_env.loops.true_plant import elastic_lags, true_plant
+from drive_env.loops.true_plant import elastic_lags
 from drive_env.motors import MOTORS
 from drive_env.trials import score as module
 from drive_env.trials.positioning import PROFILE, SETTLED, TRIAL, Move, move_terms, plan_move, reach, swing, wrapped

@@ -14,7 +14,7 @@ from drive_env.firmware.record import LANES, get_lanes, set_lanes
 from drive_env.firmware.servo.derived import derive
 from drive_env.firmware.servo.sensors import measure_angle, measure_currents, measure_motion
 from drive_env.firmware.servo.stages import FIRMWARE
-from mechanics.compiled import cached
+from mechanics.kernels.compiled import cached
 
 TWO_PI = 2.0 * math.pi
 COUNTS = 4096

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from rigs.truth import brake_is_closed
 
 from drive_env import EmulatedDrives, ObjectAccessError, cia402, motion
 from drive_env.devices import find_device
@@ -437,7 +438,7 @@ def release(drives):
     drives.machine.brake = "output"
     drives.write("M-StaticBrake", 1)
     drives.advance(0.1)
-    assert not drives.machine.brake_is_closed[0] and drives.emergencies() == []
+    assert not brake_is_closed(drives)[0] and drives.emergencies() == []
 
 
 def by_brake_switch(drives):

@@ -111,8 +111,7 @@ def test_what_takes_the_voltage_from_a_motor_that_turns_brings_it_to_rest_first(
 
 
 @pytest.mark.parametrize(
-    ("name", "value"),
-    [("60FF", 1000), ("607A", 1000), ("6071", 10), ("6060", 3), ("2003", 5000), ("2042:1", 500)],
+    ("name", "value"), [("60FF", 1000), ("607A", 1000), ("6071", 10), ("6060", 3), ("2003", 5000), ("2042:1", 500)]
 )
 @pytest.mark.parametrize("status", [ENABLED, QUICK_STOP, FAULT_REACTION])
 def test_any_other_write_to_a_live_axis_asks_first_and_says_why(drive, name, value, status):

@@ -58,10 +58,7 @@ def test_a_master_finds_the_axis_of_an_emergency():
         inside.machine.set_temperatures(25.0, hot)
         inside.advance(0.002)
         found.append(inside.emergencies())
-    with (
-        served((1, 20)) as (world, bus),
-        CanDrives(MODULE.name, bus=bus, nodes=(1, 20), pace="lockstep") as drives,
-    ):
+    with served((1, 20)) as (world, bus), CanDrives(MODULE.name, bus=bus, nodes=(1, 20), pace="lockstep") as drives:
         motion.enable(drives, mode="pv")
         world.nodes[1].drives.machine.set_temperatures(25.0, hot)
         drives.advance(0.002)
@@ -126,10 +123,7 @@ def cyclic_move(drives):
 def test_cyclic_targets_of_two_modules_are_what_they_are_in_process():
     with EmulatedDrives(MODULE.name, load="inertia", num_machines=2 * AXES, num_threads=1, seed=4) as inside:
         expected = cyclic_move(inside)
-    with (
-        served((1, 20)) as (_, bus),
-        CanDrives(MODULE.name, bus=bus, nodes=(1, 20), pace="lockstep") as drives,
-    ):
+    with served((1, 20)) as (_, bus), CanDrives(MODULE.name, bus=bus, nodes=(1, 20), pace="lockstep") as drives:
         found = cyclic_move(drives)
     np.testing.assert_array_equal(found, expected)
     assert np.abs(expected[1, -1]).min() > 0

@@ -13,7 +13,7 @@ import pytest
 
 from drive_env.firmware.common import fields, shaped
 from drive_env.firmware.record import RecordLayout
-from mechanics.compiled import cached
+from mechanics.kernels.compiled import cached
 
 DT = 0.001
 LAYOUT = RecordLayout(fields.PARAMETERS, fields.STATE)

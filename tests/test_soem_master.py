@@ -12,7 +12,7 @@ from rigs.clock import Clock
 
 from drive_env.ethercat.coe import CoeService, message, split
 from drive_env.fieldbus.errors import BusError, NoAnswerError, OpenError
-from drive_env.master.ethercat import clocks, mailbox_client, soem_master
+from drive_env.master.ethercat import clocks, mailbox_client, soem_master, state_names
 from drive_env.master.ethercat.ethercat_master import ImageSizes, SlaveIdentity, SlaveStatus, Sync0
 from drive_env.master.ethercat.mailbox_client import SdoAbortError
 from drive_env.master.ethercat.soem_master import SoemMaster
@@ -202,6 +202,7 @@ class Master:
 def clock(monkeypatch):
     found = Clock()
     monkeypatch.setattr(soem_master, "time", found)
+    monkeypatch.setattr(state_names, "time", found)
     monkeypatch.setattr(mailbox_client, "time", found)
     return found
 

@@ -8,14 +8,10 @@ import pytest
 from numba import njit, types
 from numba.core import inline_closurecall
 
-from mechanics import compiled, stage_compiler
-from mechanics.compiled import OPTIONS, inlined, stage
+from mechanics.kernels import compiled, stage_compiler
+from mechanics.kernels.compiled import OPTIONS, inlined, stage
 
-PARTS = (
-    (types.Record, "__repr__"),
-    (types.Function, "get_call_type"),
-    (inline_closurecall, "copy"),
-)
+PARTS = ((types.Record, "__repr__"), (types.Function, "get_call_type"), (inline_closurecall, "copy"))
 RECORD = np.dtype([("speed", np.float64, (4,)), ("state", np.int32, (4,))])
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from rigs.stepper_rig import SMOOTH, build, hold, lane
+from rigs.truth import brake_is_closed
 
 from drive_env import motion
 from drive_env.motors import MOTORS
@@ -43,7 +44,7 @@ def watch(drives, milliseconds):
                 int(drives.read(0x6041)[0]) & 0x6F,
                 lane(drives, "stage_on")[0],
                 drives.machine.brake_output[0],
-                bool(drives.machine.brake_is_closed[0]),
+                bool(brake_is_closed(drives)[0]),
             )
         )
     return rows
@@ -233,10 +234,10 @@ def test_a_brake_opens_by_its_pull_in_current_alone(release, opens):
         hold(drives)
         drives.advance(0.1)
         assert drives.machine.brake_output[0] == pytest.approx(release / 255)
-        assert drives.machine.brake_is_closed[0] != opens
+        assert brake_is_closed(drives)[0] != opens
         drives.write((0x200C, 2), 80)  # above its drop-out current it stays what it is
         drives.advance(0.1)
-        assert drives.machine.brake_is_closed[0] != opens
+        assert brake_is_closed(drives)[0] != opens
 
 
 def test_the_brake_falls_when_the_supply_does():
@@ -244,7 +245,7 @@ def test_the_brake_falls_when_the_supply_does():
         commission(drives)
         hold(drives)
         drives.advance(0.1)
-        assert not drives.machine.brake_is_closed[0]
+        assert not brake_is_closed(drives)[0]
         drives.machine.supply = 0.0
         drives.advance(0.5)
-        assert drives.machine.brake_is_closed[0]
+        assert brake_is_closed(drives)[0]

@@ -16,7 +16,7 @@ from drive_env.firmware.record import LANES, get_lanes, set_lanes
 from drive_env.firmware.stepper.stages import FIRMWARE
 from drive_env.firmware.stepper.winding import chop, move_rotor, power_stage, refresh_winding
 from drive_env.motors import MOTORS
-from mechanics.compiled import cached
+from mechanics.kernels.compiled import cached
 
 MOTOR = MOTORS["qsh4218_51"]
 R, L, PSI, N_P, SUPPLY = MOTOR.R_s, MOTOR.L_q, MOTOR.psi_m, 50, 24.0

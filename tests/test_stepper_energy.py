@@ -15,7 +15,7 @@ from drive_env.firmware.cycle import mechanics_window
 from drive_env.firmware.record import LANES
 from drive_env.firmware.stepper.stages import FIRMWARE
 from drive_env.motors import MOTORS
-from mechanics.compiled import cached
+from mechanics.kernels.compiled import cached
 
 start_window, supervise, tick = FIRMWARE.start_window, FIRMWARE.supervise, FIRMWARE.tick
 BRIDGE, COPPER, SHAFT, STAGE = range(4)

@@ -187,11 +187,7 @@ def test_a_servo_drive_offers_no_stepper_and_a_stepper_drive_nothing_else():
 @pytest.mark.parametrize(
     ("device", "motor", "message"),
     [
-        (
-            "tmcm1636",
-            "qsh4218_51",
-            "turns brushless and brushed motors; qsh4218_51 is a two-phase hybrid stepper",
-        ),
+        ("tmcm1636", "qsh4218_51", "turns brushless and brushed motors; qsh4218_51 is a two-phase hybrid stepper"),
         (stepper_rig.BARE, "qbl4208", "turns two-phase hybrid stepper motors; qbl4208 is a brushless motor: take qsh2"),
     ],
 )

@@ -16,15 +16,7 @@ from drive_env.emulator.inertia_check import MisfitWarning
 from drive_env.motors import MOTORS
 from mechanics.shaft import shaft_load
 from tuning.compare import suite as module
-from tuning.compare.suite import (
-    SHIPPED,
-    SuiteMachine,
-    _draw,
-    _spread,
-    groups,
-    load_suite,
-    open_group,
-)
+from tuning.compare.suite import SHIPPED, SuiteMachine, _draw, _spread, groups, load_suite, open_group
 from tuning.toml_tables import ExperimentError
 
 SMALL = """

@@ -130,10 +130,7 @@ def test_at_a_home_switch_the_initial_movement_depends_on_its_state(belt, method
     assert (way * moved[4:] < -0.002).all()
 
 
-@pytest.mark.parametrize(
-    ("method", "mask", "edge"),
-    [(17, NEGATIVE_MASK, HOME_HIGH), (18, POSITIVE_MASK, HOME_LOW)],
-)
+@pytest.mark.parametrize(("method", "mask", "edge"), [(17, NEGATIVE_MASK, HOME_HIGH), (18, POSITIVE_MASK, HOME_LOW)])
 def test_the_mask_says_which_input_a_switch_is(belt, method, mask, edge):
     """With the bit of the home switch's input a limit switch is where that one is."""
     bring(belt, 0.1 if method == 17 else -0.15)

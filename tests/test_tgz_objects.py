@@ -185,18 +185,7 @@ ELSEWHERE = {
     **{(index, 0): "test_tgz_registers.py" for index in REGISTERS},
     **{
         (index, 0): "test_tgz_own_commands.py"
-        for index in (
-            0x23C8,
-            0x23C9,
-            0x23CA,
-            *range(0x3100, 0x3105),
-            0x3109,
-            0x310A,
-            0x333C,
-            0x3904,
-            0x3905,
-            0x3909,
-        )
+        for index in (0x23C8, 0x23C9, 0x23CA, *range(0x3100, 0x3105), 0x3109, 0x310A, 0x333C, 0x3904, 0x3905, 0x3909)
     },
     (0x200D, 0): "test_tgz.py: node-ID; test_ethercat_tgz.py: alias",
     (0x25C0, 0): "test_tgz.py: images with which a drive begins",

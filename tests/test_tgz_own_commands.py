@@ -11,10 +11,10 @@ from rigs.canopen_wire import Wire
 from rigs.coe_rig import CoeRig
 from rigs.fault_injection import ANSWER, ObservedWorld, WorldBus
 from rigs.tgz_images import select
+from rigs.truth import field
 
 from drive_env import CanDrives, EmulatedDrives, Limits, SafetyError, cia402, motion
 from drive_env.ethercat.application import AlState
-from drive_env.firmware.record import get_lanes
 
 RPM = math.pi / 30.0
 TURN, UNITS = 2**32, 2**20
@@ -29,10 +29,6 @@ def new_drives(load="inertia", **given):
 def drives():
     with new_drives() as drives:
         yield drives
-
-
-def field(drives, name):
-    return get_lanes(drives.inside.records, name, drives.num_axes).astype(float)
 
 
 def serve(drives, d_mode, command=1):

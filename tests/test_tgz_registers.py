@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 from rigs.canopen_wire import Wire
 from rigs.coe_rig import CoeRig
+from rigs.truth import brake_is_closed, field
 
 from drive_env import EmulatedDrives, ObjectAccessError, cia402, motion
 from drive_env.canopen.frames import Frame
 from drive_env.devices import find_device
 from drive_env.drives.currents import read_current_limit, write_current_limit
 from drive_env.ethercat.application import AlState
-from drive_env.firmware.record import get_lanes, set_lanes
+from drive_env.firmware.record import set_lanes
 
 DEVICE = find_device("tgz_d")
 RPM = math.pi / 30.0
@@ -65,10 +66,6 @@ def new_drives(load="inertia", **given):
 def drives():
     with new_drives() as drives:
         yield drives
-
-
-def field(drives, name, part=0):
-    return get_lanes(drives.inside.records, name, drives.num_axes, part).astype(float)
 
 
 def errors(drives):
@@ -323,7 +320,7 @@ def test_a_brake_is_held_open_by_less_than_its_supply_and_closes_without_it():
             for _ in range(40):
                 drives.advance(0.001)
                 set_lanes(drives.inside.records, "drive_function", np.ones(1))
-            assert drives.machine.brake_is_closed[0] == is_closed, volts
+            assert brake_is_closed(drives)[0] == is_closed, volts
             assert (BRAKE_SUPPLY in errors(drives)) == (volts < 21.6)
         drives.write("M-StaticBrake", 0)
         drives.advance(0.002)
@@ -388,7 +385,7 @@ def test_a_weight_does_not_fall_while_its_brake_closes():
             there = float(drives.machine.rotor_angle[0])
             drives.write(cia402.CONTROLWORD, 0x06)
             drives.advance(0.3)
-            assert field(drives, "stage_on")[0] == 0.0 and drives.machine.brake_is_closed[0]
+            assert field(drives, "stage_on")[0] == 0.0 and brake_is_closed(drives)[0]
             fallen.append(abs(float(drives.machine.rotor_angle[0]) - there))
     assert fallen[1] < 0.2 * fallen[0]
 

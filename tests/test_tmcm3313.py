@@ -19,13 +19,7 @@ from rigs.world_bus import WorldBus
 from drive_env import CanDrives, EmulatedDrives, motion
 from drive_env.bus.world import World
 from drive_env.devices import find_device
-from drive_env.dictionary.aborts import (
-    READ_ONLY,
-    UNSUPPORTED_ACCESS,
-    VALUE_RANGE,
-    VALUE_TOO_HIGH,
-    VALUE_TOO_LOW,
-)
+from drive_env.dictionary.aborts import READ_ONLY, UNSUPPORTED_ACCESS, VALUE_RANGE, VALUE_TOO_HIGH, VALUE_TOO_LOW
 from drive_env.dictionary.roles import Role
 from drive_env.emulator.inertia_check import MisfitWarning
 from drive_env.motors import MOTORS

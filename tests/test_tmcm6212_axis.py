@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 from rigs.canopen_wire import Wire
+from rigs.truth import brake_is_closed
 
 from drive_env import EmulatedDrives, ObjectAccessError, motion
 from drive_env.devices import find_device
@@ -86,7 +87,7 @@ def test_each_axis_has_a_brake_output_of_its_own(wire):
     wire.wait(100)
     assert states(wire)[:2] == [0x07, 0x07]
     np.testing.assert_array_equal(wire.drives.machine.brake_output, [0, 1, 0, 0, 0, 0])
-    np.testing.assert_array_equal(wire.drives.machine.brake_is_closed, [False, False, False, False, True, True])
+    np.testing.assert_array_equal(brake_is_closed(wire.drives), [False, False, False, False, True, True])
 
 
 def test_an_axis_homes_by_its_index_and_its_latch_and_counter_read_over_the_bus(wire):

@@ -7,11 +7,11 @@ from contextlib import contextmanager
 import mujoco
 import numpy as np
 import pytest
+from rigs.chip_gains import Gains, bandwidths_from_gains
 from scipy.linalg import solve_continuous_are
 
 from drive_env import EmulatedDrives
 from drive_env.devices import find_device
-from drive_env.devices.gains import Gains, bandwidths_from_gains
 from drive_env.envs import tracking_cycle as cycle
 from drive_env.envs.highest_speed import highest_speeds
 from drive_env.envs.tracking import OBJECTS, OTHER, TASKS, TERMS, WEIGHTS, Tracking, TrackingConfig
@@ -307,10 +307,7 @@ def test_the_carried_term_is_the_error_of_where_the_bob_is():
     [
         ({"load": "inertia", "tilt": (0.1, 0.2)}, "tilt is of a pendulum, and load 'inertia' has none"),
         ({"load": "inverted_pendulum", "tilt": (0.2, 0.1)}, r"tilt is \[low, high\] within a turn, in order"),
-        (
-            {"load": "inverted_pendulum", "tilt": (0.0, 0.7)},
-            "must be beyond the greatest tilt, 0.7 rad",
-        ),
+        ({"load": "inverted_pendulum", "tilt": (0.0, 0.7)}, "must be beyond the greatest tilt, 0.7 rad"),
         ({"margins": {"traking": 1.0}}, "a margin's name is one of 'tracking', .* not 'traking'"),
         ({"margins": {"tracking": 0.0}}, "the margin of tracking must be above 0 and finite, not 0"),
         ({"action": "ramp", "ramp": 0.0}, "ramp must be above 0 and finite, not 0"),

@@ -113,10 +113,7 @@ def test_a_front_of_none_is_not_drawn():
 
 
 def test_a_third_objective_counts_for_the_front_and_is_not_drawn():
-    rows = [
-        trial(0, objectives=(0.0, 0.0, 2.0)),
-        trial(1, objectives=(math.log(2.0), math.log(2.0), 1.0)),
-    ]
+    rows = [trial(0, objectives=(0.0, 0.0, 2.0)), trial(1, objectives=(math.log(2.0), math.log(2.0), 1.0))]
     (axes,) = picture(rows, objectives=("speed", "robustness", "current")).axes
     np.testing.assert_allclose(axes.get_lines()[0].get_xydata(), [[10.0, 1.0], [20.0, 2.0]])
     assert axes.get_ylabel() == "J of the worst phase over that of the moves"

@@ -130,20 +130,7 @@ ROWS = [
     (device, fieldbus, command, how)
     for device, fieldbus, commands in (
         ("tgz_d", "ethercat", (("auto",), ("identify",), ("response",), ("auto", "--by", "agent"))),
-        (
-            "tmcm3313",
-            "ethercat",
-            (
-                ("auto",),
-                (
-                    "auto",
-                    "--by",
-                    "random",
-                    "--trials",
-                    "20",
-                ),
-            ),
-        ),
+        ("tmcm3313", "ethercat", (("auto",), ("auto", "--by", "random", "--trials", "20"))),
         ("tmcm6212", "can", (("auto",),)),
     )
     for command in commands

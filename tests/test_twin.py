@@ -8,25 +8,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from rigs.chip_gains import Gains
+from rigs.known_machines import true_plant
 
 from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
-from drive_env.devices.gains import Gains, rule_gains
+from drive_env.devices.gains import rule_gains
 from drive_env.dictionary.units import RPM
 from drive_env.loops.linear_model import Plant
-from drive_env.loops.true_plant import true_plant
 from drive_env.motors import find_motor
 from drive_env.trials.oscillation import OSCILLATION
 from drive_env.trials.score import robust_cost
 from tuning.auto import twin
-from tuning.auto.twin import (
-    WORLDS,
-    Known,
-    MachineVariant,
-    Twins,
-    known_of,
-    twin_parameters,
-)
+from tuning.auto.twin import WORLDS, Known, MachineVariant, Twins, known_of, twin_parameters
 from tuning.estimate import Estimate, refused
 from tuning.identify.identified_axis import Identification
 

@@ -38,8 +38,8 @@ from drive_env.randomisation.random_machines import Distributions
 from drive_env.studio import runs_folder
 from drive_env.trials.replay import read_log
 from drive_env.whole_file import content_hash
-from mechanics import untrusted
-from mechanics.untrusted import UntrustedFileError, parse_json, parse_toml, read_arrays, read_bytes, read_toml
+from mechanics.reading import untrusted
+from mechanics.reading.untrusted import UntrustedFileError, parse_json, parse_toml, read_arrays, read_bytes, read_toml
 from tuning.certificate import certificate, certificate_files
 from tuning.commands.cli import app as tune_app
 from tuning.compare.suite import load_suite

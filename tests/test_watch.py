@@ -173,8 +173,7 @@ def test_what_was_stopped_is_switched_off_at_the_end_but_for_what_is_lost(clock,
 
 # --- how old a sample may be --------------------------------------------------------------------------------------
 @pytest.mark.parametrize(
-    ("live", "age", "polls"),
-    [(True, 0.0079, 0), (True, 0.0081, 1), (False, 0.0149, 0), (False, 0.0151, 1)],
+    ("live", "age", "polls"), [(True, 0.0079, 0), (True, 0.0081, 1), (False, 0.0149, 0), (False, 0.0151, 1)]
 )
 def test_drives_are_looked_at_after_8_ms_and_after_15_where_all_are_off(clock, live, age, polls):
     watch, done = watch_of(age=age)

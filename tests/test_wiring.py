@@ -22,13 +22,7 @@ from tuning.auto.one_button import Method, auto
 from tuning.compare.suite import load_suite, open_group
 from tuning.identify.identification import identify
 from tuning.identify.quick_identification import identify_briefly
-from tuning.identify.wiring import (
-    Setting,
-    changes,
-    corrected,
-    finding,
-    judge_halls,
-)
+from tuning.identify.wiring import Setting, changes, corrected, finding, judge_halls
 from tuning.target import Target, emulated
 
 MOTOR = MOTORS["qbl4208"]

@@ -6,7 +6,7 @@ emulated machine behind them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import cache
 from typing import TYPE_CHECKING
 
@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from drive_env import cia402
 from drive_env.devices import find_device
-from drive_env.dictionary.entries import ObjectDictionary, ObjectName
+from drive_env.dictionary.entries import ObjectDictionary, ObjectName, Rows
 from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count, counts_per_ampere
 from drive_env.drives.interface import Drives, Observer
@@ -94,14 +94,7 @@ class DriveAudit(Observer):
         entry = self._dictionary.find(name)
         self._counter.written((entry.index, entry.sub), value, axes)
 
-    def passed(
-        self,
-        below: Drives,
-        duration: float,
-        trace: Trace,
-        asked: Sequence[ObjectName],
-        play: Mapping[ObjectName, ArrayLike] | None,
-    ) -> None:
+    def passed(self, below: Drives, duration: float, trace: Trace, asked: Sequence[ObjectName], play: Rows) -> None:
         """Count time, moves and violations."""
         self.elapsed += duration
         rows = {(entry.index, entry.sub): values for entry, values in self._entries(play)}
@@ -115,7 +108,7 @@ class DriveAudit(Observer):
         else:
             self._watch_current(current)
 
-    def _entries(self, play: Mapping[ObjectName, ArrayLike] | None) -> list[tuple[Entry, ArrayLike]]:
+    def _entries(self, play: Rows) -> list[tuple[Entry, ArrayLike]]:
         return [(self._dictionary.find(name), values) for name, values in (play or {}).items()]
 
     def _watch(self, trace: Trace) -> None:

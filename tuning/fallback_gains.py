@@ -6,13 +6,12 @@ axis, once shaken, stays in a limit cycle with them; this is detected only here.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from drive_env import cia402
-from drive_env.dictionary.entries import ObjectName
+from drive_env.dictionary.entries import ObjectName, Rows
 from drive_env.drives.currents import ampere_per_count
 from drive_env.drives.interface import Drives, Observer
 from drive_env.drives.raw_gains import write_gains
@@ -50,14 +49,7 @@ class FallbackGains(Observer):
         self.calmed[:] = False
         self._windows[:] = 0
 
-    def passed(
-        self,
-        below: Drives,
-        duration: float,
-        trace: Trace,
-        asked: Sequence[ObjectName],
-        play: Mapping[ObjectName, ArrayLike] | None,
-    ) -> None:
+    def passed(self, below: Drives, duration: float, trace: Trace, asked: Sequence[ObjectName], play: Rows) -> None:
         """Give slow gains to axes that have shaken too long."""
         if self.calm is None or cia402.TORQUE_ACTUAL not in asked or len(trace) != WATCH:
             return

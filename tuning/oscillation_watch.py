@@ -7,14 +7,13 @@ no larger than it takes. A loop that oscillates breaks the one rule or the other
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from drive_env import cia402, motion
-from drive_env.dictionary.entries import ObjectName
+from drive_env.dictionary.entries import ObjectName, Rows
 from drive_env.drives.currents import ampere_per_count
 from drive_env.drives.interface import Drives, Observer, device_of
 from drive_env.drives.raw_gains import write_gains
@@ -63,14 +62,7 @@ class OscillationWatch(Observer):
         """Return the cycles until the window is full."""
         return WATCH - self._looked()
 
-    def passed(
-        self,
-        below: Drives,
-        duration: float,
-        trace: Trace,
-        asked: Sequence[ObjectName],
-        play: Mapping[ObjectName, ArrayLike] | None,
-    ) -> None:
+    def passed(self, below: Drives, duration: float, trace: Trace, asked: Sequence[ObjectName], play: Rows) -> None:
         """Look at the currents, and switch oscillating axes off."""
         if self._ampere is None:
             self._ampere = ampere_per_count(below)

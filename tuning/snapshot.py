@@ -40,7 +40,7 @@ from drive_env.master.single_axes import SingleAxes
 from drive_env.safety.envelope import SafetyError
 from drive_env.whole_file import FORMAT, check_seal, sealed, write_whole
 from mechanics.arrays import Mask
-from mechanics.untrusted import read_toml
+from mechanics.reading.untrusted import read_toml
 from tuning.runs.provenance import nearest_place, run_folder
 from tuning.toml_tables import toml
 
@@ -302,12 +302,6 @@ def write_parameters(drives: Drives, wanted: Mapping[Key, int]) -> list[list[Dif
     """
     single = _per_axis(drives)
     return [write_all_or_none(single, wanted, place) for place in _places(drives)]
-
-
-def compare_parameters(drives: Drives, wanted: Mapping[Key, int]) -> list[list[Difference]]:
-    """Return which parameters of each axis have another value."""
-    single = _per_axis(drives)
-    return [compare(single, wanted, place) for place in _places(drives)]
 
 
 def _set_points(known: Description) -> list[Key]:

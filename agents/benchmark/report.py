@@ -17,7 +17,7 @@ from agents.training.training_run import TABLE
 from drive_env.envs.suite import TASKS
 from drive_env.whole_file import write_picture, write_whole
 from mechanics.arrays import Floats
-from mechanics.untrusted import read_rows as read_rows_of
+from mechanics.reading.untrusted import read_rows as read_rows_of
 
 TEXT, NUMBERS, CURVES = "results.md", "results.json", "learning_curves.png"
 EXPERT, ALL = "expert", "all tasks"

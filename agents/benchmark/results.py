@@ -15,7 +15,7 @@ from typing import Any
 from agents.seeds import TEST
 from drive_env.envs.suite import TASKS
 from drive_env.whole_file import content_hash
-from mechanics.untrusted import read_json
+from mechanics.reading.untrusted import read_json
 
 RESULT = "result.json"
 TRAINED, SUBMITTED, BASELINE = "trained", "submitted", "baseline"

@@ -26,7 +26,7 @@ from agents.tasks import environment_name
 from agents.training.training_run import AGENT, TABLE, TrainingRun
 from drive_env.envs.suite import TASKS
 from drive_env.whole_file import write_whole
-from mechanics.untrusted import MOST_ARRAYS, read_bytes
+from mechanics.reading.untrusted import MOST_ARRAYS, read_bytes
 from tuning.runs.provenance import check_begun, versions
 
 if TYPE_CHECKING:

@@ -58,7 +58,7 @@ POLICIES: dict[str, dict[str, Plain]] = {
 }
 # Likewise, of a task beside those of its environment: of a stepper a speed is what one commands.
 OWN_POLICIES: dict[str, dict[str, Plain]] = {
-    "ServoDrive/StepperRun-v1": {f"speed {share:g}": _steady(share) for share in SPEEDS},
+    "ServoDrive/StepperRun-v1": {f"speed {share:g}": _steady(share) for share in SPEEDS}
 }
 
 

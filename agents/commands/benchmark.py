@@ -35,8 +35,7 @@ AGAIN = "continue with --resume and the same --out"
 def benchmark(
     context: typer.Context,
     task: Annotated[
-        list[str] | None,
-        typer.Option("--task", help="Task of the suite; may be repeated.", show_default="all of them"),
+        list[str] | None, typer.Option("--task", help="Task of the suite; may be repeated.", show_default="all of them")
     ] = None,
     algorithm: Annotated[
         list[str] | None,

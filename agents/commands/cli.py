@@ -8,10 +8,7 @@ from drive_env.commands.program import Program, Quiet, Verbose, Version, say_as_
 
 app = Program("drive-agent")
 
-PANELS = {
-    "Use an agent": ("evaluate", "margins", "export"),
-    "Make one": ("train", "search", "benchmark"),
-}
+PANELS = {"Use an agent": ("evaluate", "margins", "export"), "Make one": ("train", "search", "benchmark")}
 for panel, names in PANELS.items():
     for name in names:
         module = importlib.import_module(f"agents.commands.{name}")

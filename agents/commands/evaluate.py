@@ -273,7 +273,7 @@ def opened_for(
     from agents.tasks import environment_name
     from drive_env.envs.suite import TASKS
     from drive_env.randomisation.random_machines import shipped as shipped_distributions
-    from mechanics.untrusted import read_toml
+    from mechanics.reading.untrusted import read_toml
     from tuning.runs.inputs import taken_options
 
     loaded = LoadedPolicy(text, None) if is_baseline(text) else open_policy(text, trust=trust)

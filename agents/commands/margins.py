@@ -7,15 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from agents.commands.options import (
-    REFUSED,
-    Json,
-    Trust,
-    errors_as_exit_codes,
-    fail,
-    print_json,
-    progress_bar,
-)
+from agents.commands.options import REFUSED, Json, Trust, errors_as_exit_codes, fail, print_json, progress_bar
 
 if TYPE_CHECKING:
     from agents.policies.agent_file import AgentFile

@@ -14,7 +14,7 @@ from agents.plain import plain
 from agents.policies.guard import PATIENT, GuardedPolicy
 from drive_env.whole_file import write_arrays
 from mechanics.arrays import Mask, Singles
-from mechanics.untrusted import parse_json, read_arrays
+from mechanics.reading.untrusted import parse_json, read_arrays
 from tuning.runs.inputs import as_kept
 
 

@@ -27,7 +27,7 @@ from drive_env.drives.observed import ObservedDrives
 from drive_env.envs import environment_of
 from drive_env.realtime_section import undisturbed
 from drive_env.whole_file import write_whole
-from mechanics.untrusted import read_json
+from mechanics.reading.untrusted import read_json
 from tuning.runs.inputs import as_kept, found_again, hashes, inputs_in
 
 LANES = 64

@@ -12,7 +12,7 @@ from agents.evaluation.evaluation import Evaluation, environments_for, evaluate,
 from agents.evaluation.open_policy import names_a_file, opened, source_of
 from agents.evaluation.scores import Episode
 from agents.tasks import configuration_of, environment_name, make_environments
-from mechanics.untrusted import MOST_ARRAYS, read_bytes
+from mechanics.reading.untrusted import MOST_ARRAYS, read_bytes
 from tuning.runs.inputs import taken_options
 
 if TYPE_CHECKING:

@@ -29,10 +29,7 @@ def save(name: str, found: Evaluation) -> None:
     minari: Any = _minari()
     terminated, truncated = ends_of(found.episodes)
     buffers: list[Any] = []
-    with (
-        gymnasium.make(f"drive_env:{found.environment}", config=found.configuration) as env,
-        warnings.catch_warnings(),
-    ):
+    with gymnasium.make(f"drive_env:{found.environment}", config=found.configuration) as env, warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # it wants an author and an address, which are not known here
         space = env.observation_space
         first = 0

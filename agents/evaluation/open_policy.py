@@ -19,7 +19,7 @@ import numpy as np
 
 from agents.policies.policy import ACTOR, load_policy
 from agents.shipped import shipped, shipped_names
-from mechanics.untrusted import read_bytes
+from mechanics.reading.untrusted import read_bytes
 from tuning.runs.inputs import found_again
 
 CHECKPOINT = ".zip"  # ending of a file of Stable-Baselines3, which holds pickles

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mechanics.untrusted import TooLargeError, parse_json, read_arrays
+from mechanics.reading.untrusted import TooLargeError, parse_json, read_arrays
 from tuning.runs.inputs import as_kept, found_again
 
 FORMAT, FORMAT_VERSION = "drive-agent", 1

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike
 from agents.policies.agent_file import BundleError
 from agents.policies.policy import PolicyError
 from mechanics.arrays import Mask, Singles
-from mechanics.limited_child import call_limited
-from mechanics.untrusted import parse_json, read_bytes
+from mechanics.reading.limited_child import call_limited
+from mechanics.reading.untrusted import parse_json, read_bytes
 
 METADATA = "drive_agent"
 MOST_BYTES = 100_000_000  # of a file: far more than any policy that makes its millisecond

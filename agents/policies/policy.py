@@ -166,16 +166,19 @@ class MlpPolicy:
         """
         x = self._ends.enter(observation)
         with np.errstate(over="ignore", invalid="ignore"):  # `leave` reports the consequence
-            for weight, bias in self._hidden:
-                x = self._activation(x @ weight + bias)
-            x = x @ self._last[0] + self._last[1]
+            x = self._outputs(x)
         return self._ends.leave(x, observation)
+
+    def _outputs(self, x: Singles) -> Singles:
+        for weight, bias in self._hidden:
+            x = self._activation(x @ weight + bias)
+        return x @ self._last[0] + self._last[1]
 
     def reset(self, mask: Mask | None = None) -> None:
         """Do nothing: there is no state."""
 
 
-class LstmPolicy:
+class LstmPolicy(MlpPolicy):
     """A layer of LSTM cells, then fully connected layers; each environment has its own state.
 
     Arrays besides those of `MlpPolicy`: lstm_input (entries, 4 cells), lstm_state (cells, 4 cells), lstm_bias (4
@@ -183,10 +186,7 @@ class LstmPolicy:
     """
 
     def __init__(self, bundle: AgentFile) -> None:
-        self.bundle = bundle
-        self._ends = Ends(bundle)
-        *self._hidden, self._last = _layers(bundle)
-        self._activation = ACTIVATIONS[_choice("activation", bundle.settings["activation"], ACTIVATIONS)]
+        super().__init__(bundle)
         self._input, self._recurrent, self._bias = (
             np.ascontiguousarray(bundle.arrays[f"lstm_{name}"], np.float32) for name in ("input", "state", "bias")
         )
@@ -206,9 +206,7 @@ class LstmPolicy:
             enter, forget, cell, leave = np.split(gates, 4, axis=1)
             self._cell = sigmoid(forget) * self._cell + sigmoid(enter) * np.tanh(cell)
             x = self._state = sigmoid(leave) * np.tanh(self._cell)
-            for weight, bias in self._hidden:
-                x = self._activation(x @ weight + bias)
-            x = x @ self._last[0] + self._last[1]
+            x = self._outputs(x)
         return self._ends.leave(x, observation)
 
     def reset(self, mask: Mask | None = None) -> None:

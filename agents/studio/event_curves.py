@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from mechanics.untrusted import MOST_RECORDING, check_size
+from mechanics.reading.untrusted import MOST_RECORDING, check_size
 
 EVENTS = "events.out.tfevents."
 MOST_POINTS = 20_000  # of a curve that are read

@@ -23,7 +23,7 @@ import numpy as np
 
 from agents.training.algorithms import algorithm_class, need
 from drive_env.whole_file import write_whole
-from mechanics.untrusted import MOST_TEXT, member_names, parse_json, read_member
+from mechanics.reading.untrusted import MOST_TEXT, member_names, parse_json, read_member
 
 MOST_UNPACKED = 16_000_000_000  # bytes of a replay buffer: a million observations of a thousand entries, twice
 # What the JSON of a run has besides: it is read before anybody is trusted.

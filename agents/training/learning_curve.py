@@ -8,7 +8,7 @@ import math
 from pathlib import Path
 
 from drive_env.whole_file import write_picture
-from mechanics.untrusted import MOST_RECORDING, read_text
+from mechanics.reading.untrusted import MOST_RECORDING, read_text
 
 TERM = "term "  # what columns of reward terms begin with
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#999999")

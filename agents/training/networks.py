@@ -16,12 +16,7 @@ PACKAGES = ("drive-env", "numpy", "torch", "stable-baselines3", "sb3-contrib", "
 
 
 def bundle_of(
-    model: Any,
-    normaliser: Any,
-    *,
-    environment: str,
-    configuration: Mapping[str, Any],
-    card: Mapping[str, Any],
+    model: Any, normaliser: Any, *, environment: str, configuration: Mapping[str, Any], card: Mapping[str, Any]
 ) -> AgentFile:
     """Return the actor of a model as a bundle.
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from drive_env.whole_file import naming
-from mechanics.untrusted import MOST_RECORDING, read_text
+from mechanics.reading.untrusted import MOST_RECORDING, read_text
 
 
 class TrainingTable:

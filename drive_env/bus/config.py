@@ -12,7 +12,7 @@ from drive_env.bus.faults import Faults
 from drive_env.bus.wire import BIT_RATE, Wire
 from drive_env.bus.world import World
 from drive_env.default_device import DEFAULT_DEVICE
-from mechanics.untrusted import read_toml
+from mechanics.reading.untrusted import read_toml
 
 if TYPE_CHECKING:  # MuJoCo takes long to import
     from drive_env.emulator.emulated_drives import EmulatedDrives

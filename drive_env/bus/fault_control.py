@@ -14,7 +14,7 @@ from typing import Any
 
 from drive_env.bus.bus_faults import BusFaults
 from drive_env.faults.schedule import parse_order
-from mechanics.untrusted import parse_json
+from mechanics.reading.untrusted import parse_json
 
 LOOPBACK = "127.0.0.1"
 PORT = 29637  # beside the hub's

@@ -38,14 +38,7 @@ SDO_REQUEST = 0x600
 ERROR_CONTROL = 0x700
 
 # Identifiers that no configurable object may take (CiA 301, table 41 of version 4.2): first and last of each range.
-RESTRICTED = (
-    (0x000, 0x07F),
-    (0x101, 0x180),
-    (0x581, 0x5FF),
-    (0x601, 0x67F),
-    (0x6E0, 0x6FF),
-    (0x701, 0x7FF),
-)
+RESTRICTED = ((0x000, 0x07F), (0x101, 0x180), (0x581, 0x5FF), (0x601, 0x67F), (0x6E0, 0x6FF), (0x701, 0x7FF))
 
 # Bits of an object that holds an identifier.
 INVALID = 1 << 31  # EMCY, PDO: 1 switches the object off

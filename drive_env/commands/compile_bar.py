@@ -5,14 +5,14 @@ from __future__ import annotations
 import atexit
 import logging
 import sys
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from drive_env.commands.progress import progress_on, shown
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
-KERNELS = "mechanics.kernel_files"  # who logs what is compiled
+KERNELS = "mechanics.kernels.kernel_files"  # who logs what is compiled
 # Functions that Numba compiles for a kernel, its stages included, if those above were compiled before. Whatever runs
 # drives takes the first three.
 FUNCTIONS = {
@@ -36,7 +36,7 @@ def show_compiling() -> CompileBar:
 
 
 class CompileBar(logging.Handler):
-    """Shows the log of `mechanics.kernel_files`: lines as they are, kernels as a bar whose parts are functions."""
+    """Shows the log of `kernel_files`: lines as they are, kernels as a bar whose parts are functions."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -48,7 +48,7 @@ class CompileBar(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Show a record."""
-        from mechanics.kernel_files import COMPILED, COMPILING
+        from mechanics.kernels.kernel_files import COMPILED, COMPILING
 
         if record.levelno > logging.DEBUG:
             if not logging.getLogger().handlers:  # with --verbose the log has it
@@ -90,16 +90,7 @@ class CompileBar(logging.Handler):
             self._bars.update(self._task, visible=False)
 
     def _watch(self) -> None:
-        from numba.core import event
+        from mechanics.kernels.compiled import call_after_each_function
 
-        bar = self
-
-        class Listener(event.Listener):  # type: ignore[misc]  # Numba has no types
-            def on_start(self, _event: Any) -> None:
-                pass
-
-            def on_end(self, _event: Any) -> None:
-                bar.count()
-
-        event.register("numba:compile", Listener())
+        call_after_each_function(self.count)
         atexit.register(self._end)  # a terminal gets its cursor back, whatever ends the program

@@ -30,7 +30,7 @@ def compile_kernels(
     """
     from rich.console import Console
 
-    from mechanics.compiled import user_cache_folder
+    from mechanics.kernels.compiled import user_cache_folder
 
     with errors_as_exit_codes():
         steps = _steps(devices or [DEFAULT_DEVICE])

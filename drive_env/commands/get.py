@@ -51,10 +51,7 @@ def get(
     Nothing is written. A node on CAN that is in the NMT state stopped, where it answers no SDO, is taken to
     pre-operational first, by an NMT command, and stays there.
     """
-    with (
-        errors_as_exit_codes(),
-        bus.connect(eds, safety=False) as drives,
-    ):
+    with errors_as_exit_codes(), bus.connect(eds, safety=False) as drives:
         entries = [drives.description.dictionary.find(object_name(name)) for name in objects]
         scales = [None] * drives.num_axes if raw else scales_of(drives)
         rows = []

@@ -82,7 +82,7 @@ def write_model(load: Load, gears: dict[str, float], out: Path) -> Path:
     from mechanics.loads import find_load
     from mechanics.model import with_motors
     from mechanics.model_files import files_of_model
-    from mechanics.untrusted import MOST_RECORDING, read_bytes
+    from mechanics.reading.untrusted import MOST_RECORDING, read_bytes
 
     text, root = with_motors(load, gears), load.mjcf.parent
     path = out / f"{load.mjcf.stem}.xml"

@@ -139,8 +139,7 @@ def _table(drives: BusDrives, axes: list[int], entries: list[Any], watch: _Pushi
             ]
             told = emergencies[-5:] + pushing
             live.update(
-                _draw(drives, axes, _look(drives, axes, entries), scales, told, live.console.width),
-                refresh=True,
+                _draw(drives, axes, _look(drives, axes, entries), scales, told, live.console.width), refresh=True
             )
             if time.monotonic() + period > end:
                 return
@@ -148,12 +147,7 @@ def _table(drives: BusDrives, axes: list[int], entries: list[Any], watch: _Pushi
 
 
 def _draw(
-    drives: BusDrives,
-    axes: list[int],
-    values: dict[Any, Any],
-    scales: list[Scale],
-    told: list[str],
-    width: int,
+    drives: BusDrives, axes: list[int], values: dict[Any, Any], scales: list[Scale], told: list[str], width: int
 ) -> Any:
     from rich.console import Group
     from rich.text import Text

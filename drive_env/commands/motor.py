@@ -37,8 +37,7 @@ ESTIMATES = {
 @motor_app.command("new")
 def new_motor(
     file: Annotated[
-        Path | None,
-        typer.Argument(help="New TOML file to write; only --list needs none.", show_default=False),
+        Path | None, typer.Argument(help="New TOML file to write; only --list needs none.", show_default=False)
     ] = None,
     kind: Annotated[str | None, typer.Option("--kind", help="pmsm (brushless), dc (brushed) or stepper.")] = None,
     title: Annotated[str, typer.Option("--title", help="Name of the motor.")] = "",

@@ -40,8 +40,7 @@ def move(
     position: Annotated[str, typer.Argument(help="Where to: '2 rev', '-90 deg', or increments.")],
     relative: Annotated[bool, typer.Option("--relative", help="Move by it, from where the axis is.")] = False,
     speed: Annotated[
-        str | None,
-        typer.Option(help="Profile velocity of this move: '300 rpm'.", show_default="the drive's, 6081h"),
+        str | None, typer.Option(help="Profile velocity of this move: '300 rpm'.", show_default="the drive's, 6081h")
     ] = None,
     *,
     bus: AxisOptions,

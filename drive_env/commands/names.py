@@ -20,7 +20,7 @@ def list_names(
     from drive_env.devices import device_names, find_device
     from drive_env.motors import MOTORS
     from mechanics.loads import LOADS
-    from mechanics.near_names import did_you_mean
+    from mechanics.reading.near_names import did_you_mean
 
     with errors_as_exit_codes():
         if kind is not None and kind not in KINDS:

@@ -32,7 +32,7 @@ def objects(
     """
     from drive_env.dictionary.search import AREAS, area_of, searched
     from drive_env.fieldbus.description import describe
-    from mechanics.near_names import did_you_mean
+    from mechanics.reading.near_names import did_you_mean
 
     with errors_as_exit_codes():
         if area is not None and area not in AREAS:

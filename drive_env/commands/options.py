@@ -57,8 +57,7 @@ Nodes = Annotated[
     ),
 ]  # fmt: skip
 Node = Annotated[
-    int | None,
-    typer.Option("--node", "-n", help="Node-ID, on EtherCAT the position.", show_default=FIRST_NODE),
+    int | None, typer.Option("--node", "-n", help="Node-ID, on EtherCAT the position.", show_default=FIRST_NODE)
 ]
 AxisOfNode = Annotated[
     int | None,

@@ -13,8 +13,8 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from mechanics.limited_child import call_limited
-from mechanics.untrusted import MOST_RECORDING, check_size
+from mechanics.reading.limited_child import call_limited
+from mechanics.reading.untrusted import MOST_RECORDING, check_size
 
 MEMORY = 4_000_000_000  # bytes for the frames that are sent, some 10^7
 LONGEST_REASON = 200  # letters of what python-can says of a broken place: it may repeat a line

@@ -13,7 +13,7 @@ import typer
 from drive_env.commands.options import USER_ERROR, fail
 from drive_env.commands.progress import progress_on
 from drive_env.programs import CLOSED, output_is_closed
-from mechanics.untrusted import read_text
+from mechanics.reading.untrusted import read_text
 
 # Whatever takes long to import (the compiler, MuJoCo, matplotlib) is imported when it is needed.
 

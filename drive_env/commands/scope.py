@@ -53,8 +53,7 @@ class Trigger(NamedTuple):
 @grouped
 def scope(
     objects: Annotated[
-        list[str] | None,
-        typer.Argument(help="Objects that can be mapped; by default demands and responses."),
+        list[str] | None, typer.Argument(help="Objects that can be mapped; by default demands and responses.")
     ] = None,
     *,
     bus: AxesOptions,

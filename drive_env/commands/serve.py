@@ -44,8 +44,7 @@ def serve(
     device: Annotated[str | None, typer.Argument(help="Device, e.g. tmcm1636 (the default).")] = None,
     load: Annotated[str | None, typer.Option(help="Load on the motor; two_mass by default.")] = None,
     motor: Annotated[
-        str | None,
-        typer.Option(help="Motor, a name or a TOML file; the device's usual one by default."),
+        str | None, typer.Option(help="Motor, a name or a TOML file; the device's usual one by default.")
     ] = None,
     factory: Annotated[
         bool, typer.Option("--factory", help="Drives with factory values, not commissioned for their motor.")
@@ -102,8 +101,7 @@ def serve(
         Path | None, typer.Option(help="Write all frames to this file, for Wireshark; on EtherCAT alone.")
     ] = None,
     ready_file: Annotated[
-        Path | None,
-        typer.Option(help="JSON for scripts: written once the drives can be reached, removed at the end."),
+        Path | None, typer.Option(help="JSON for scripts: written once the drives can be reached, removed at the end.")
     ] = None,
 ) -> None:
     """Put emulated drives on a CAN bus for python-can, python-canopen and drive-env, or on EtherCAT for its masters."""
@@ -217,13 +215,7 @@ def _serve_ethercat(
 
 
 def _server(
-    bus: Bus,
-    real_time: bool,
-    port: int,
-    listen: str,
-    token: str | None,
-    interface: str | None,
-    channel: str | None,
+    bus: Bus, real_time: bool, port: int, listen: str, token: str | None, interface: str | None, channel: str | None
 ) -> Server:
     """Return the server of a bus, its kernels compiled, its transport open."""
     from drive_env.bus.config import BusConfigError, build_world

@@ -33,8 +33,8 @@ from drive_env.dictionary.parts import Part, parts_of
 from drive_env.dictionary.roles import Role
 from drive_env.firmware import checked_firmware, default_motor, find_firmware, motor_kinds
 from drive_env.motors import EXTRA_LOW_VOLTAGE, KINDS, MOTORS, Motor, is_extra_low, motors_of
-from mechanics.near_names import did_you_mean
-from mechanics.untrusted import read_toml
+from mechanics.reading.near_names import did_you_mean
+from mechanics.reading.untrusted import read_toml
 
 if TYPE_CHECKING:
     from drive_env.firmware.cycle import Firmware

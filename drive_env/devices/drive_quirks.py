@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from mechanics.near_names import did_you_mean
+from mechanics.reading.near_names import did_you_mean
 
 MAY_BE_ABSENT = (4, 7, 9, 10, 11, 13, 14, 15)  # the others are the state, or what a handshake waits for
 OF_OBJECTS = ("refuses_same_mode", "strict_transmission_types")  # what the record knows nothing of

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from mechanics.near_names import did_you_mean
+from mechanics.reading.near_names import did_you_mean
 
 MEMORY = (0x1000, 0x3000)  # where a controller has memory for sync managers: 8 KiB
 LEAST_MAILBOX = 32  # bytes

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from drive_env.cia402 import Key
 from mechanics.arrays import Floats, Integers, Mask
-from mechanics.untrusted import read_toml
+from mechanics.reading.untrusted import read_toml
 
 if TYPE_CHECKING:
     from drive_env.dictionary.axis_objects import AxisObjects
@@ -302,10 +302,7 @@ def _closed_loop(table: Mapping[str, Any], known: Sequence[str]) -> ClosedLoop:
     loop = ClosedLoop(table["kind"], table["mode"], table["gains"], table.get("first", {}))
     if loop.kind not in KINDS:
         raise ValueError(f"closed_loop: kind = {loop.kind!r} is unknown; there are {', '.join(KINDS)}")
-    for what, given, there in (
-        ("gains", loop.gains.values(), known),
-        ("first", loop.first, tuple(loop.gains)),
-    ):
+    for what, given, there in (("gains", loop.gains.values(), known), ("first", loop.first, tuple(loop.gains))):
         if wrong := [name for name in given if name not in there]:
             raise ValueError(f"closed_loop: {what}: {', '.join(wrong)}: no such gain; there are {', '.join(there)}")
     return loop

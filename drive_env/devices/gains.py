@@ -34,28 +34,6 @@ RawGains = Sequence[int] | Integers  # in the order of the device's gain set
 Part = tuple[str, str]  # of a cascade: loop, and "P" or "I"
 
 
-class Gains(NamedTuple):
-    """Raw integers of a cascade of PI, PI and P loops, as the chip counts them."""
-
-    torque_p: int
-    torque_i: int
-    velocity_p: int
-    velocity_i: int
-    position_p: int
-
-
-class Bandwidths(NamedTuple):
-    """The bandwidths of gains on a motor with a total inertia.
-
-    current_hz, velocity_hz [Hz], velocity_integration_s [s], position_hz [Hz] (k_v / 2 pi).
-    """
-
-    current_hz: float
-    velocity_hz: float
-    velocity_integration_s: float
-    position_hz: float
-
-
 class SiGains(NamedTuple):
     """Raw gains in SI units; nan for one that a drive does not have.
 
@@ -124,20 +102,6 @@ def bandwidth_gains(
         if not gain.lowest - 0.5 <= value < gain.highest + 0.5:
             raise ValueError(f"{gain.title} would be {value:.0f}, outside 1...{gain.highest}; choose another bandwidth")
     return np.array([round(value) for value in own], np.int64)
-
-
-def bandwidths_from_gains(
-    device: Device, motor: Motor, inertia: float, gains: RawGains, *, supply: float | None = None
-) -> Bandwidths:
-    """Return the bandwidths of a device's gains; the inverse of `bandwidth_gains`. nan for gains that it lacks."""
-    two_pi = 2.0 * math.pi
-    torque_p, _, velocity_p, velocity_i, position_p = as_chip(device, gains)
-    return Bandwidths(
-        current_hz=torque_p / _torque_p_scale(device, motor, supply) / two_pi,
-        velocity_hz=velocity_p / _velocity_p_scale(device, motor, inertia) / two_pi,
-        velocity_integration_s=65536.0 / device.velocity_rate / velocity_i if velocity_i else math.inf,
-        position_hz=position_p / _POSITION_P_SCALE / two_pi,
-    )
 
 
 # --- the baseline rule ------------------------------------------------------------------------------------------------
@@ -220,7 +184,7 @@ def small_time_constants(device: Device, velocity_filter: ArrayLike, current_hz:
 
 # --- other devices' gains ---------------------------------------------------------------------------------------------
 PI = "pi"  # the cascade, as a device names it
-# The chip's gains in the order of `Gains`: loop and part, and the unit that it counts them in.
+# The chip's gains in their order, torque, velocity, position: loop and part, and the unit that it counts them in.
 _CHIP = {
     ("current", "P"): "current P",
     ("current", "I"): "I",

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from drive_env.cia402 import Key
-from mechanics.untrusted import read_toml
+from mechanics.reading.untrusted import read_toml
 
 # Data types of fields: character of `struct` for the bits as they are, and how many.
 TYPES = {"u8": ("B", 8), "u16": ("H", 16), "i16": ("H", 16), "u32": ("I", 32), "i32": ("I", 32), "i64": ("Q", 64)}

@@ -603,10 +603,7 @@ class _Draft:
         fixed = [f"{index:04X}h" for index in sorted(indices) if self._is_fixed_pdo(index)]
         if fixed:
             self._fill_in.append(
-                Note(
-                    ", ".join(fixed),
-                    "sub-index 1 can only be read: masters take them as they stand, or go by SDO",
-                )
+                Note(", ".join(fixed), "sub-index 1 can only be read: masters take them as they stand, or go by SDO")
             )
 
     def _is_fixed_pdo(self, index: int) -> bool:

@@ -19,15 +19,7 @@ from drive_env.devices.eds_process_data import RPDOS, TPDOS
 from drive_env.devices.esi_dictionary import TYPES as ESI_TYPES
 from drive_env.devices.esi_dictionary import dictionary_sections
 from drive_env.devices.ethercat import MEMORY, EtherCatBehaviour, Place
-from drive_env.devices.vendor_esi import (
-    CLASS_CYCLE,
-    CLASS_EEPROM,
-    MOST_ENTRIES,
-    RX_PDOS,
-    TX_PDOS,
-    VendorEsi,
-    one_line,
-)
+from drive_env.devices.vendor_esi import CLASS_CYCLE, CLASS_EEPROM, MOST_ENTRIES, RX_PDOS, TX_PDOS, VendorEsi, one_line
 from drive_env.dictionary.drive_eds import axes_of, read_types
 from drive_env.dictionary.eds_file import UNSIGNED, EdsFile, Section, object_section, parse_eds, place_of
 from drive_env.dictionary.eds_values import number_of

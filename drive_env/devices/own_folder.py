@@ -28,8 +28,8 @@ from drive_env.dictionary.entries import ObjectDictionary
 from drive_env.dictionary.position_scale import COARSEST, FINEST, is_scale, position_scale
 from drive_env.dictionary.roles import Role
 from drive_env.dictionary.units import UNITS, find_unit
-from mechanics.near_names import did_you_mean
-from mechanics.untrusted import read_toml
+from mechanics.reading.near_names import did_you_mean
+from mechanics.reading.untrusted import read_toml
 
 BINDINGS = "bindings.toml"
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from mechanics.near_names import did_you_mean
+from mechanics.reading.near_names import did_you_mean
 
 LSS_BIT_RATES = (1000, 800, 500, 250, 125, 50, 20, 10)  # kbit/s of CiA 305's table
 # Causes that a device's table of emergencies may have besides: SYNC of another length than 1019h says, and PDOs that

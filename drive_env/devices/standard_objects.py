@@ -14,7 +14,7 @@ from typing import NamedTuple
 from drive_env import cia402
 from drive_env.devices.variants import parse_key
 from drive_env.dictionary.bindings import Binding
-from mechanics.untrusted import read_toml
+from mechanics.reading.untrusted import read_toml
 
 TORQUE = "torque"
 # Numbers of 6098h that homing knows (firmware/common/modes/hm.py).

@@ -26,8 +26,8 @@ from drive_env.devices.services import OPTIONAL_EMERGENCIES
 from drive_env.dictionary import units
 from drive_env.dictionary.bindings import Binding
 from drive_env.dictionary.entries import EdsText, ObjectDictionary
-from mechanics.near_names import did_you_mean
-from mechanics.untrusted import read_toml
+from mechanics.reading.near_names import did_you_mean
+from mechanics.reading.untrusted import read_toml
 
 FAMILIES = ("stepper",)  # each a file beside `DEFAULTS`
 DEFAULTS = Path(__file__).parent / "defaults.toml"
@@ -143,11 +143,7 @@ def _with_optional_rows(base: Mapping[str, Any]) -> dict[str, Any]:
     emergencies, canopen = base["emergencies"], base["canopen"]
     more = dict.fromkeys(OPTIONAL_EMERGENCIES, emergencies["fault_reset"])
     objects = {"serial_number": "1018:4", **canopen["objects"]}
-    return {
-        **base,
-        "emergencies": {**more, **emergencies},
-        "canopen": {**canopen, "objects": objects},
-    }
+    return {**base, "emergencies": {**more, **emergencies}, "canopen": {**canopen, "objects": objects}}
 
 
 def check_rates(rates: Mapping[str, float]) -> None:

@@ -22,8 +22,8 @@ from drive_env.devices.ethercat import (
     PdoRule,
     Place,
 )
-from mechanics.near_names import did_you_mean
-from mechanics.untrusted import UntrustedFileError, parse_xml, read_bytes
+from mechanics.reading.near_names import did_you_mean
+from mechanics.reading.untrusted import UntrustedFileError, parse_xml, read_bytes
 
 MANAGERS = ("MBoxOut", "MBoxIn", "Outputs", "Inputs")  # of a drive with CoE: sync managers 0 to 3
 ROLE = 0x0F  # bits of a control byte: kind and direction

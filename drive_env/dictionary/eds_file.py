@@ -28,7 +28,7 @@ from drive_env.dictionary.eds_values import (
     number_of,
 )
 from drive_env.dictionary.standard_types import STANDARD_TYPES
-from mechanics.untrusted import UntrustedFileError
+from mechanics.reading.untrusted import UntrustedFileError
 
 VARIABLES, GROUPS = (2, 7), (8, 9)  # ObjectType: DOMAIN, VAR; ARRAY, RECORD
 VAR, RECORD = 7, 9

@@ -6,24 +6,27 @@ import copy
 import difflib
 import io
 import struct
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import canopen
 import numpy as np
 from canopen.objectdictionary import ODArray, ODRecord, ODVariable, datatypes
+from numpy.typing import ArrayLike
 
 from drive_env.dictionary.aborts import NO_SUCH_OBJECT, NO_SUCH_SUB_INDEX, ObjectAccessError
 from drive_env.dictionary.eds_file import EdsFile, parse_eds
 from drive_env.dictionary.roles import Role
-from mechanics.untrusted import read_bytes
+from mechanics.reading.untrusted import read_bytes
 
 # How callers name an object: index (sub-index 0), (index, sub-index), a role, or a name of CiA's; a sub-object's name
 # is "Object.Sub-object". Case does not matter.
 ObjectName: TypeAlias = int | tuple[int, int] | str | Role
+ObjectNames: TypeAlias = ObjectName | Sequence[ObjectName]
+Rows: TypeAlias = Mapping[Any, ArrayLike] | None  # of values to play, one for each cycle, by the objects' names
 
 # Width [bits], least and greatest value of each integer type of CiA 301.
 _WIDTHS = (8, 16, 24, 32, 40, 48, 56, 64)

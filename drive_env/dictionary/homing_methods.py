@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from mechanics.untrusted import read_toml
+from mechanics.reading.untrusted import read_toml
 
 WITHOUT_INDEX = 16  # from a method with an index to the one that ends at the switch's edge
 HERE = (35, 37)  # which move nothing

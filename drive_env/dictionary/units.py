@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mechanics.arrays import Floats
-from mechanics.near_names import did_you_mean
+from mechanics.reading.near_names import did_you_mean
 
 TWO_PI = 2.0 * np.pi
 MILLIAMPERE = 1e-3  # [A]
@@ -110,12 +110,7 @@ UNITS: dict[str, Unit] = {
             lambda c: RPM * c.velocity_ratio,
             follows_scale=True,
         ),
-        Unit(
-            "velocity unit/s",
-            "velocity units per second",
-            lambda c: RPM * c.velocity_ratio,
-            follows_scale=True,
-        ),
+        Unit("velocity unit/s", "velocity units per second", lambda c: RPM * c.velocity_ratio, follows_scale=True),
         Unit(
             "set-point unit",
             "velocity units times numerator over denominator of the set-point factor",

@@ -7,7 +7,7 @@ where rows are played, the axes left out get the value that they have.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +21,7 @@ from drive_env.drives.trace import Trace
 from mechanics.arrays import Integers, Mask
 
 if TYPE_CHECKING:
-    from drive_env.dictionary.entries import Entry, ObjectName
+    from drive_env.dictionary.entries import Entry, ObjectName, ObjectNames, Rows
     from drive_env.drives.emergency import EmergencyMessage
     from drive_env.drives.limits import Limits
 
@@ -112,13 +112,7 @@ class ChosenAxes(DrivesProxy):
         whole[self._axes] = given
         self._drives.write(name, whole, where=mask)
 
-    def record(
-        self,
-        objects: ObjectName | Sequence[ObjectName],
-        duration: float,
-        play: Mapping[Any, ArrayLike] | None = None,
-        period: float = 0.001,
-    ) -> Trace:
+    def record(self, objects: ObjectNames, duration: float, play: Rows = None, period: float = 0.001) -> Trace:
         """Let time pass while objects of the chosen axes are recorded and played."""
         rows = {name: self._rows(name, np.asarray(values)) for name, values in (play or {}).items()}
         return self._drives.record(objects, duration, rows or None, period).of_axes(self._axes.tolist())

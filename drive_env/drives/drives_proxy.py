@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Self
 
 from numpy.typing import ArrayLike
 
@@ -14,7 +14,7 @@ from mechanics.arrays import Integers, Mask
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
-    from drive_env.dictionary.entries import ObjectName
+    from drive_env.dictionary.entries import ObjectName, ObjectNames, Rows
     from drive_env.drives.emergency import EmergencyMessage
 
 
@@ -80,13 +80,7 @@ class DrivesProxy:
         """Let time pass [s]."""
         self._drives.advance(duration)
 
-    def record(
-        self,
-        objects: ObjectName | Sequence[ObjectName],
-        duration: float,
-        play: Mapping[Any, ArrayLike] | None = None,
-        period: float = 0.001,
-    ) -> Trace:
+    def record(self, objects: ObjectNames, duration: float, play: Rows = None, period: float = 0.001) -> Trace:
         """Let time pass [s] while objects are recorded and played."""
         return self._drives.record(objects, duration, play, period)
 

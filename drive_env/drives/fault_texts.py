@@ -7,7 +7,7 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
-from mechanics.untrusted import read_toml
+from mechanics.reading.untrusted import read_toml
 
 _PACKAGE = Path(__file__).parents[1]
 # In a wheel it lies in the package; in a working copy it is where the documentation is made.

@@ -17,7 +17,7 @@ from mechanics.arrays import Floats, Integers, Mask
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
-    from drive_env.dictionary.entries import Entry, ObjectName
+    from drive_env.dictionary.entries import Entry, ObjectName, ObjectNames, Rows
     from drive_env.drives.emergency import EmergencyMessage
     from drive_env.drives.limits import Limits
     from drive_env.drives.trace import Trace
@@ -147,14 +147,7 @@ class Observer:
     def passes(self, duration: float) -> None:
         """Take note that time is about to pass [s]."""
 
-    def passed(
-        self,
-        below: Drives,
-        duration: float,
-        trace: Trace,
-        asked: Sequence[ObjectName],
-        play: Mapping[ObjectName, ArrayLike] | None,
-    ) -> None:
+    def passed(self, below: Drives, duration: float, trace: Trace, asked: Sequence[ObjectName], play: Rows) -> None:
         """Look at what has passed.
 
         Args:
@@ -200,13 +193,7 @@ class Drives(BasicDrives, Protocol):
     def observers(self) -> tuple[Observer, ...]:
         """Who looks at these drives, the innermost first."""
 
-    def record(
-        self,
-        objects: ObjectName | Sequence[ObjectName],
-        duration: float,
-        play: Mapping[Any, ArrayLike] | None = None,
-        period: float = 0.001,
-    ) -> Trace:
+    def record(self, objects: ObjectNames, duration: float, play: Rows = None, period: float = 0.001) -> Trace:
         """Let time pass [s] while objects are recorded, and others, the keys of `play`, are written row by row."""
 
     def emergencies(self) -> list[EmergencyMessage]:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,7 +14,7 @@ from drive_env.drives.trace import Trace
 from mechanics.arrays import Mask
 
 if TYPE_CHECKING:
-    from drive_env.dictionary.entries import ObjectName
+    from drive_env.dictionary.entries import ObjectName, ObjectNames, Rows
 
 CYCLE = 0.001  # s
 
@@ -58,13 +57,7 @@ class ObservedDrives(DrivesProxy):
             observer.passes(duration)
         self._drives.advance(duration)
 
-    def record(
-        self,
-        objects: ObjectName | Sequence[ObjectName],
-        duration: float,
-        play: Mapping[Any, ArrayLike] | None = None,
-        period: float = CYCLE,
-    ) -> Trace:
+    def record(self, objects: ObjectNames, duration: float, play: Rows = None, period: float = CYCLE) -> Trace:
         """Let time pass while objects are recorded and played, and have observers look at it as it goes on."""
         asked: list[ObjectName] = [objects] if isinstance(objects, int | str | Role) else list(objects)
         wanted = list(asked)
@@ -76,7 +69,7 @@ class ObservedDrives(DrivesProxy):
         while done < cycles:
             patience = [cycles - done, *(n for n in (each.patience() for each in self._observers) if n is not None)]
             now = min(patience)
-            part: Mapping[ObjectName, ArrayLike] | None = play
+            part: Rows = play
             if now < cycles:
                 part = {name: values[done : done + now] for name, values in rows.items()} or None
             span = duration if now == cycles else now * CYCLE

@@ -17,9 +17,9 @@ from drive_env.drives.interface import Drives
 from drive_env.emulator.group import call_of
 from drive_env.emulator.prepared_record import PreparedRecord, from_od_rows, to_od_rows
 from mechanics.arrays import Integers
-from mechanics.bundle import Bundle, Cube, Matrix, NumberCube, Numbers, reader
-from mechanics.calls import address_of_hook, call_hook
-from mechanics.compiled import cached
+from mechanics.kernels.bundle import Bundle, Cube, Matrix, NumberCube, Numbers, reader
+from mechanics.kernels.calls import address_of_hook, call_hook
+from mechanics.kernels.compiled import cached
 
 if TYPE_CHECKING:
     from drive_env.emulator.emulated_drives import EmulatedDrives

@@ -6,10 +6,9 @@ Whatever acts on a drive uses this interface and nothing deeper, so that it runs
 from __future__ import annotations
 
 import warnings
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,7 +17,7 @@ from drive_env.cores import usable_cores
 from drive_env.default_device import DEFAULT_DEVICE
 from drive_env.devices import find_device
 from drive_env.dictionary.codec import Code
-from drive_env.dictionary.entries import ObjectName
+from drive_env.dictionary.entries import ObjectName, ObjectNames, Rows
 from drive_env.dictionary.quantities import AxisScale, Scale, integers, is_quantity
 from drive_env.drives.arguments import checked_mask, object_names
 from drive_env.drives.emergency import EmergencyMessage
@@ -215,13 +214,7 @@ class EmulatedDrives(Saved):
             self.inside.change_rates(device)
             self.faults.change_cycle(longer)
 
-    def record(
-        self,
-        objects: ObjectName | Sequence[ObjectName],
-        duration: float,
-        play: Mapping[Any, ArrayLike] | None = None,
-        period: float = 0.001,
-    ) -> Trace:
+    def record(self, objects: ObjectNames, duration: float, play: Rows = None, period: float = 0.001) -> Trace:
         """Let `duration` [s] pass while objects are recorded and played.
 
         Cycle k: row k of `play` is written, then row k is recorded, then one communication cycle passes. In csp and

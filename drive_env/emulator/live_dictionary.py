@@ -395,9 +395,7 @@ class LiveDictionary:
         """Return the values that the factors of units depend on now, one per axis."""
         of_axes: dict[str, Any] = {name: self._scale_field(name) for name in (SCALE_FIELD, *self.other_scales)}
         return units.Context(
-            **of_axes,
-            current_lsb=self.device.current_full_scale / 32768.0,
-            rated_current=self.device.rated_current,
+            **of_axes, current_lsb=self.device.current_full_scale / 32768.0, rated_current=self.device.rated_current
         )
 
     def _scale_field(self, name: str) -> Floats:
@@ -550,8 +548,7 @@ def check_state(device: Device, entry: Entry, state: int) -> None:
 def refuse_same_mode(entry: Entry, mode: int) -> NoReturn:
     """Raise 08000022h: the axis has this mode already."""
     raise ObjectAccessError(
-        WRONG_STATE,
-        f"{entry.label} is {mode} already, and this drive refuses the same mode twice; read 6061h first",
+        WRONG_STATE, f"{entry.label} is {mode} already, and this drive refuses the same mode twice; read 6061h first"
     )
 
 

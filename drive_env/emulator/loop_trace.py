@@ -47,10 +47,7 @@ class LoopTrace(NamedTuple):
 
 
 def trace_loops(
-    drives: Drives,
-    signals: Sequence[str],
-    duration: float,
-    play: Mapping[ObjectName, ArrayLike] | None = None,
+    drives: Drives, signals: Sequence[str], duration: float, play: Mapping[ObjectName, ArrayLike] | None = None
 ) -> LoopTrace:
     """Let `duration` [s] pass while signals are sampled at the start of every window of the velocity loop.
 

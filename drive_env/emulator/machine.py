@@ -19,7 +19,6 @@ from drive_env.emulator.parameters import check_known, check_one_supply, check_p
 from drive_env.emulator.record_snapshot import RecordSnapshot
 from drive_env.faults.schedule import Order
 from drive_env.faults.table import FAULTS
-from drive_env.firmware.common.brake import CLOSED, WITH_OUTPUT, WITH_STAGE
 from drive_env.firmware.record import get_lanes, set_lanes
 from mechanics.arrays import Floats, Integers, Mask
 
@@ -122,12 +121,7 @@ class Machines:
                 group.load.plant.load_torque[:] = calm
 
     def load_profile(
-        self,
-        at: ArrayLike | None,
-        torque: ArrayLike | None = None,
-        *,
-        of: str = "time",
-        period: float | None = None,
+        self, at: ArrayLike | None, torque: ArrayLike | None = None, *, of: str = "time", period: float | None = None
     ) -> None:
         """Add a torque from a table to `load_torque`, interpolated linearly, in all machines; None takes it away.
 
@@ -209,15 +203,6 @@ class Machines:
     def brake_output(self) -> Floats:
         """Current of each axis' brake output, as a share of its largest, shape (num_axes,); 0 without an output."""
         return self._axis_field("brake_output")
-
-    @property
-    def brake_is_closed(self) -> Mask:
-        """Whether each axis' brake holds, shape (num_axes,)."""
-        mode = self._axis_field("brake_mode")
-        off = self._axis_field("stage_on") == 0.0
-        shut = self._axis_field("brake_opened") == 0.0
-        closed: Mask = (mode == CLOSED) | ((mode == WITH_STAGE) & off) | ((mode == WITH_OUTPUT) & shut)
-        return closed
 
     @property
     def joint_positions(self) -> Floats:

@@ -16,7 +16,7 @@ from drive_env.firmware.record import get_lanes, set_lanes
 from drive_env.motors import Motor
 from mechanics.arrays import Floats, Integers, Mask
 from mechanics.load import Load
-from mechanics.near_names import did_you_mean
+from mechanics.reading.near_names import did_you_mean
 
 Records = NDArray[np.void]
 Write = Callable[[Records, Device, Motor, Floats, Mask], None]

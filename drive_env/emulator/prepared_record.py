@@ -12,19 +12,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from drive_env.dictionary.codec import (
-    HIGH,
-    LOW,
-    PERIOD,
-    SPECIAL_RAW,
-    SPECIAL_SI,
-    SPECIALS,
-    Code,
-    compiled_rows,
-)
+from drive_env.dictionary.codec import HIGH, LOW, PERIOD, SPECIAL_RAW, SPECIAL_SI, SPECIALS, Code, compiled_rows
 from drive_env.dictionary.entries import ObjectName
 from drive_env.emulator.group import Channels
-from mechanics.compiled import cached, stage
+from mechanics.kernels.compiled import cached, stage
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

@@ -52,7 +52,7 @@ def environment_of(name: str) -> str:
         return TASKS[name].environment
     if name in ENVIRONMENTS:
         return name
-    from mechanics.near_names import did_you_mean  # not before `commands` has looked whose `mechanics` that is
+    from mechanics.reading.near_names import did_you_mean  # not before `commands` has looked whose `mechanics` that is
 
     known = (*ENVIRONMENTS, *TASKS)
     raise ValueError(f"there is no environment {name!r}{did_you_mean(name, known)}; there are {', '.join(known)}")

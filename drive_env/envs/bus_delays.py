@@ -16,8 +16,8 @@ from numba import types
 from numpy.typing import NDArray
 
 from drive_env.saved_state import Saved
-from mechanics.bundle import Bundle, Cube, Matrix, NumberMatrix, Numbers, Vector, reader
-from mechanics.compiled import cached, inlined, stage
+from mechanics.kernels.bundle import Bundle, Cube, Matrix, NumberMatrix, Numbers, Vector, reader
+from mechanics.kernels.compiled import cached, inlined, stage
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]

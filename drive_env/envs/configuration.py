@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from drive_env.motors import Motor
-from mechanics.near_names import did_you_mean
-from mechanics.untrusted import read_toml
+from mechanics.reading.near_names import did_you_mean
+from mechanics.reading.untrusted import read_toml
 
 Config = TypeVar("Config")
 

@@ -20,14 +20,7 @@ from drive_env.drives.interface import Drives, machine_of
 from drive_env.drives.raw_gains import read_gains
 from drive_env.emulator.emulated_drives import emulated_of
 from drive_env.envs.configuration import configured
-from drive_env.envs.gain_observation import (
-    RATIO_MAX,
-    TRIED,
-    identified_entries,
-    rows_of,
-    tried_entries,
-    true_entries,
-)
+from drive_env.envs.gain_observation import RATIO_MAX, TRIED, identified_entries, rows_of, tried_entries, true_entries
 from drive_env.envs.pictures import Pictures
 from drive_env.envs.vector_environment import Info, Reward, Stepped, VectorEnvironment, check_choice
 from drive_env.loops.dynamics import DEFAULT, find_dynamics
@@ -482,10 +475,7 @@ class GainTuning(VectorEnvironment):
 
     def _told(self) -> Info:
         n = self.num_envs
-        info: Info = {
-            "gains": self._best.reshape(n, self._axes, -1).copy(),
-            "measured": self._measured.copy(),
-        }
+        info: Info = {"gains": self._best.reshape(n, self._axes, -1).copy(), "measured": self._measured.copy()}
         if self._score is not None:
             info["robust_cost"] = self._robust_cost.copy()
         if self._owned:

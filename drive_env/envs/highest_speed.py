@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from drive_env.firmware.common.warming import NOMINAL
 from drive_env.motors import COPPER, Motor
 from mechanics.arrays import Floats
-from mechanics.compiled import cached, stage
+from mechanics.kernels.compiled import cached, stage
 
 STEPS = 160  # of the electrical period, a multiple of 4
 SETTLING = 4.0  # time constants L/R, until the currents repeat

@@ -96,9 +96,5 @@ def _sine(t: Floats, reach: Reach, rng: np.random.Generator) -> Floats:
     way = 0.5 * abs(size) * reach.distance
     w = pace * float(np.min(np.minimum(reach.speed / way, np.sqrt(reach.acceleration / way))))
     return np.stack(
-        [
-            0.5 * size * (1.0 - np.cos(w * t)),
-            0.5 * size * w * np.sin(w * t),
-            0.5 * size * w * w * np.cos(w * t),
-        ]
+        [0.5 * size * (1.0 - np.cos(w * t)), 0.5 * size * w * np.sin(w * t), 0.5 * size * w * w * np.cos(w * t)]
     )

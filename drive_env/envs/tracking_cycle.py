@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from drive_env import cia402
 from drive_env.envs.bus_delays import Line, pass_on
-from mechanics.bundle import Bundle, Cube, Matrix, NumberCube, Vector, reader
-from mechanics.compiled import cached, inlined, stage
+from mechanics.kernels.bundle import Bundle, Cube, Matrix, NumberCube, Vector, reader
+from mechanics.kernels.compiled import cached, inlined, stage
 
 # An environment's episode: step and number of steps; the pendulum's angle at the last step [rad]; whether it fell.
 LANE = np.dtype([("step", "i8"), ("steps", "i8"), ("angle", "f8"), ("fallen", "i8")])

@@ -277,8 +277,7 @@ class CoeNode:
         port.check(raw)
         if self.state is not AlState.OP and raw & ENABLE_OPERATION == ENABLE_OPERATION:
             raise ObjectAccessError(
-                WRONG_STATE,
-                f"{port.entry.label} cannot enable operation in {self.state.name}; motors run in Op alone",
+                WRONG_STATE, f"{port.entry.label} cannot enable operation in {self.state.name}; motors run in Op alone"
             )
 
     # --- EEPROM -------------------------------------------------------------------------------------------------------

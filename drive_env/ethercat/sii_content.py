@@ -178,11 +178,7 @@ def _sync_managers(behaviour: EtherCatBehaviour, outputs: int, inputs: int) -> b
 
 
 def _pdos(
-    behaviour: EtherCatBehaviour,
-    objects: dict[int, ObjectDescription],
-    direction: int,
-    manager: int,
-    strings: _Strings,
+    behaviour: EtherCatBehaviour, objects: dict[int, ObjectDescription], direction: int, manager: int, strings: _Strings
 ) -> bytes:
     content = b""
     rows = [(manager, *one) for one in mapped(objects, direction)]

@@ -97,10 +97,7 @@ class EtherCatSlave:
         """Return when `run_until` has something to do [s]; infinite while there is nothing."""
         pulse = self.controller.clock.next_pulse()
         deadline = self.controller.watchdog_deadline() if self._is_watched else None
-        return min(
-            float("inf") if pulse is None else pulse * 1e-9,
-            float("inf") if deadline is None else deadline,
-        )
+        return min(float("inf") if pulse is None else pulse * 1e-9, float("inf") if deadline is None else deadline)
 
     def run_until(self, now: float) -> None:
         """Let pulses of SYNC0 and SYNC1 and the watchdog happen that are due until `now` [s]."""

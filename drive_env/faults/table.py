@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from mechanics.near_names import did_you_mean
-from mechanics.untrusted import read_toml
+from mechanics.reading.near_names import did_you_mean
+from mechanics.reading.untrusted import read_toml
 
 GROUPS = ("sensor", "motor", "supply", "load", "bus", "node")
 

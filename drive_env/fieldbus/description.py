@@ -219,13 +219,7 @@ def describe(device: str | None, eds: str | Path | None, on_ethercat: bool = Fal
         if on_ethercat and known.ethercat is not None:
             dictionary = dictionary.including(written_objects(known.eds, known.ethercat.writable).values())
         return Description(
-            known.name,
-            dictionary,
-            known.num_axes,
-            known,
-            known.master,
-            cycle=known.cycle,
-            _types=read_types(known.eds),
+            known.name, dictionary, known.num_axes, known, known.master, cycle=known.cycle, _types=read_types(known.eds)
         )
     path = Path(eds)
     if not path.is_file():

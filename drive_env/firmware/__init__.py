@@ -7,7 +7,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mechanics.near_names import did_you_mean
+from mechanics.reading.near_names import did_you_mean
 
 if TYPE_CHECKING:
     from drive_env.firmware.cycle import Firmware

@@ -21,9 +21,9 @@ from drive_env.firmware.common.modes import hm, pp
 from drive_env.firmware.common.protection import Cause, protection_of, row_of
 from drive_env.firmware.record import LANES, Field, RecordLayout
 from mechanics import stepping
-from mechanics.bundle import Bundle, Cube, Matrix, Numbers, reader
-from mechanics.calls import call_hook, next_number
-from mechanics.compiled import cached, inlined, stage
+from mechanics.kernels.bundle import Bundle, Cube, Matrix, Numbers, reader
+from mechanics.kernels.calls import call_hook, next_number
+from mechanics.kernels.compiled import cached, inlined, stage
 from mechanics.plant import PackedPlant
 
 # How a played or written value acts on a field.

@@ -32,7 +32,7 @@ from drive_env.saved_state import Saved
 from mechanics.arrays import Floats, Integers
 from mechanics.load import Load, Switch
 from mechanics.loads import BARE_SHAFT, find_load
-from mechanics.untrusted import read_json
+from mechanics.reading.untrusted import read_json
 
 SETTINGS = "drive.json"  # of an FMU, among its resources
 NO_LOAD = "none"

@@ -18,7 +18,7 @@ from drive_env.fmu.slave import STANDARDS, Standard
 from drive_env.motors import MOTORS
 from drive_env.whole_file import write_whole
 from mechanics.loads import LOADS
-from mechanics.untrusted import read_bytes
+from mechanics.reading.untrusted import read_bytes
 
 # What an importer finds in an FMU; the library looks for the line of the class.
 SCRIPT = '''"""A drive of drive-env {version} as an FMU."""

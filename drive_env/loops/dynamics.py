@@ -18,7 +18,7 @@ import numpy as np
 
 from drive_env.loops.sampled import STILL, ClosedLoops, closed_loops, open_loops, step_overshoot, window
 from mechanics.arrays import Complex, Floats
-from mechanics.untrusted import read_toml
+from mechanics.reading.untrusted import read_toml
 
 if TYPE_CHECKING:
     from drive_env.loops.sampled import CascadeGains, LinearMachines, LoopRates

@@ -11,7 +11,7 @@ import atexit
 import contextlib
 import logging
 import signal
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from types import TracebackType
 from typing import Any, Self
 
@@ -23,7 +23,7 @@ from drive_env.cia402 import Key
 from drive_env.devices import device_of, find_device
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.access import check_readable, check_writable, checked_values
-from drive_env.dictionary.entries import Entry, ObjectName
+from drive_env.dictionary.entries import Entry, ObjectName, ObjectNames, Rows
 from drive_env.dictionary.position_scale import position_scale
 from drive_env.dictionary.quantities import Scale, follows_scale, integers, is_quantity, scales_of
 from drive_env.dictionary.roles import Role
@@ -173,13 +173,7 @@ class BusDrives:
             return
         self._cycle_runner.pass_time(cycles, self.safety)
 
-    def record(
-        self,
-        objects: ObjectName | Sequence[ObjectName],
-        duration: float,
-        play: Mapping[Any, ArrayLike] | None = None,
-        period: float = 0.001,
-    ) -> Trace:
+    def record(self, objects: ObjectNames, duration: float, play: Rows = None, period: float = 0.001) -> Trace:
         """Let `duration` [s] pass while objects are recorded and played.
 
         Cycle k: row k of `play` goes out, then SYNC, at which the drives take it and sample row k of `objects`, which

@@ -13,7 +13,7 @@ import numpy as np
 from drive_env.dictionary.access import check_in_range, check_writable
 from drive_env.master.identity import Identity, load_identity, read_identity
 from drive_env.whole_file import FORMAT, check_seal
-from mechanics.untrusted import read_toml
+from mechanics.reading.untrusted import read_toml
 
 if TYPE_CHECKING:
     from drive_env.dictionary.entries import ObjectDictionary

@@ -17,8 +17,8 @@ from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from mechanics.near_names import did_you_mean
-from mechanics.untrusted import read_toml
+from mechanics.reading.near_names import did_you_mean
+from mechanics.reading.untrusted import read_toml
 
 FOLDER = Path(__file__).parent
 

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from itertools import product
 
 from drive_env.motors import NUMBERS, RPM, WHOLE
-from mechanics.near_names import did_you_mean
+from mechanics.reading.near_names import did_you_mean
 
 _INCH, _POUND, _GRAVITY = 0.0254, 0.45359237, 9.80665  # m, kg, m/s^2
 _LB_IN = _POUND * _GRAVITY * _INCH  # N m

@@ -16,12 +16,7 @@ from functools import partial
 import numpy as np
 
 from drive_env.devices import Device
-from drive_env.dictionary.aborts import (
-    SUB_INDEX_ZERO_IN_USE,
-    VALUE_RANGE,
-    WRONG_STATE,
-    ObjectAccessError,
-)
+from drive_env.dictionary.aborts import SUB_INDEX_ZERO_IN_USE, VALUE_RANGE, WRONG_STATE, ObjectAccessError
 from drive_env.dictionary.access import check_allowed, check_limits, check_writable
 from drive_env.dictionary.entries import Entry, ObjectDictionary
 from drive_env.dictionary.roles import Role

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mechanics.untrusted import read_json
+from mechanics.reading.untrusted import read_json
 
 if TYPE_CHECKING:
     from drive_env.cia402 import Key

@@ -16,7 +16,7 @@ from drive_env.default_device import DEFAULT_DEVICE
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.drives import motion
 from mechanics.arrays import Floats
-from mechanics.untrusted import read_toml
+from mechanics.reading.untrusted import read_toml
 
 if TYPE_CHECKING:
     from drive_env.emulator.emulated_drives import EmulatedDrives

@@ -26,7 +26,7 @@ from drive_env.faults.table import FAULTS, names_of
 from drive_env.randomisation.random_faults import RandomFaults, check_ranges
 from drive_env.saved_state import Saved
 from mechanics.arrays import Floats, Mask
-from mechanics.untrusted import read_toml
+from mechanics.reading.untrusted import read_toml
 
 if TYPE_CHECKING:
     from drive_env.devices import Device

@@ -48,14 +48,7 @@ from drive_env.safety.errors import SafetyError as SafetyError
 from drive_env.safety.errors import logged
 from drive_env.safety.lending import Lending
 from drive_env.safety.limits_in_force import STOP_WITHIN, LimitsInForce
-from drive_env.safety.objects import (
-    CONTROLWORD,
-    MODE,
-    SET_POINTS,
-    STATUSWORD,
-    STORE,
-    VL_BRAKING,
-)
+from drive_env.safety.objects import CONTROLWORD, MODE, SET_POINTS, STATUSWORD, STORE, VL_BRAKING
 from drive_env.safety.rotor import HOME_OFFSET, scale_objects
 from drive_env.safety.stop_runner import RAMPS, SLOW_DOWN_RAMPS, StopRunner
 from drive_env.safety.stopping import Stop

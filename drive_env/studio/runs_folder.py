@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from mechanics.untrusted import read_json, read_start, read_toml
+from mechanics.reading.untrusted import read_json, read_start, read_toml
 
 RUNS = Path("runs")
 ROUTE = "/studio/runs/"

@@ -37,7 +37,7 @@ from drive_env.studio.sentences import sentence
 from drive_env.studio.session import Session
 from drive_env.studio.visitor import Visitor
 from drive_env.studio.workspace import CHOICES, OF_VL, AxisSettings, object_key, object_name, trigger_of
-from mechanics.untrusted import parse_json
+from mechanics.reading.untrusted import parse_json
 
 FRAME = 0.05  # s between two frames
 LIVE = 5.0  # s across the plot of the page Axes

@@ -33,7 +33,7 @@ from drive_env.studio.page import StudioPage
 from drive_env.studio.pages_thread import PagesThread, Receive, Scope, Send
 from drive_env.studio.session import Session
 from drive_env.studio.visitor import Visitor
-from mechanics.untrusted import parse_json
+from mechanics.reading.untrusted import parse_json
 
 logger = logging.getLogger(__name__)
 

@@ -16,7 +16,7 @@ from drive_env.fieldbus.description import Description
 from drive_env.studio.scope_trigger import EDGES, ScopeTrigger
 from drive_env.studio.scope_view import MODES, MOST_CHANNELS, WINDOWS
 from drive_env.whole_file import write_whole
-from mechanics.untrusted import read_toml
+from mechanics.reading.untrusted import read_toml
 
 FORMAT = 1
 CHANNELS = (cia402.POSITION_ACTUAL, cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL)

@@ -26,16 +26,7 @@ from drive_env.phase_current import amplitude, holding_torque, rated_setting, ru
 from drive_env.trials.gain_trial import PHASES, Identified, Trials
 from drive_env.trials.open_loop import OPEN, TOOTH, OpenLoopTrials, with_run_current
 from drive_env.trials.oscillation import OSCILLATION
-from drive_env.trials.positioning import (
-    CYCLE,
-    PROFILE,
-    TRAVEL_SHARE,
-    TRIAL,
-    Move,
-    move_terms,
-    wrapped,
-    write_profile,
-)
+from drive_env.trials.positioning import CYCLE, PROFILE, TRAVEL_SHARE, TRIAL, Move, move_terms, wrapped, write_profile
 from drive_env.trials.score import Terms, cost
 from mechanics.arrays import Floats, Integers, Mask
 

@@ -157,13 +157,7 @@ class Trials(Saved):
         return momentum_balance(angle, speed, current * ampere_per_count(drives), self._motor, moving=moving), origin
 
     def run(
-        self,
-        gains: Integers,
-        incumbent: Integers,
-        move: Move,
-        origin: Integers,
-        direction: Integers,
-        where: Mask,
+        self, gains: Integers, incumbent: Integers, move: Move, origin: Integers, direction: Integers, where: Mask
     ) -> Trial:
         """Try gains, raw integers of shape (num_axes, count), in a move from the origin [inc], back, and there again.
 

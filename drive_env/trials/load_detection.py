@@ -26,17 +26,7 @@ from drive_env.drives.speeds import per_increment
 from drive_env.motors import Motor
 from drive_env.phase_current import holding_torque, run_and_standby
 from drive_env.trials.gain_trial import PHASES, Identified
-from drive_env.trials.load_reading import (
-    FULL_READING,
-    LIFT,
-    SLOW,
-    STALL_ANGLE,
-    THRESHOLD,
-    angle_of,
-    falls,
-    flux,
-    volts,
-)
+from drive_env.trials.load_reading import FULL_READING, LIFT, SLOW, STALL_ANGLE, THRESHOLD, angle_of, falls, flux, volts
 from drive_env.trials.open_loop import (
     PROBE,
     VIBRATION,

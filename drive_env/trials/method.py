@@ -13,12 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drive_env.devices.gain_set import LOAD_DETECTION, PID_ALONE
-from drive_env.devices.gains import (
-    BASELINE_RULE,
-    bandwidth_gains,
-    rule_gains,
-    small_time_constants,
-)
+from drive_env.devices.gains import BASELINE_RULE, bandwidth_gains, rule_gains, small_time_constants
 from drive_env.phase_current import currents_for, rated_setting, swing_period, with_currents
 from drive_env.trials.closed_loop import ClosedLoopTrials, plan_overload
 from drive_env.trials.gain_trial import Identified, Trials, softness

@@ -22,8 +22,8 @@ from drive_env.drives import motion
 from drive_env.randomisation.random_machines import BESIDE, Distributions, Law
 from drive_env.trials.positioning import CYCLE
 from mechanics.arrays import Floats, Integers, Mask
-from mechanics.near_names import did_you_mean
-from mechanics.untrusted import read_rows
+from mechanics.reading.near_names import did_you_mean
+from mechanics.reading.untrusted import read_rows
 
 if TYPE_CHECKING:
     from drive_env.emulator.emulated_drives import EmulatedDrives

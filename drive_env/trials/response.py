@@ -123,13 +123,7 @@ def step_metrics(
 
 
 def disturbance_metrics(
-    t: ArrayLike,
-    y: ArrayLike,
-    reference: ArrayLike,
-    *,
-    t_load: float,
-    t_end: float | None = None,
-    band: float = 0.1,
+    t: ArrayLike, y: ArrayLike, reference: ArrayLike, *, t_load: float, t_end: float | None = None, band: float = 0.1
 ) -> DisturbanceMetrics:
     """Return dip, recovery time and IAE of a load step between t_load and t_end.
 

@@ -13,10 +13,10 @@ import pytest
 from sources import ROOT, nodes_of
 
 PACKAGES = ("mechanics", "drive_env", "tuning", "agents", "research")
-# The rooms from below to above: a file imports from its own room and from those before it, for types alone, too. A room
-# is a folder of `drive_env`, `tuning` or `agents`, or a file beside these; `mechanics` and `research` are one each.
+# The rooms from below to above: a file imports from its own room and those before it, for types alone, too. A room is a
+# folder of `drive_env`, `tuning` or `agents`, or a file beside these. The rest of `mechanics` is one, and `research`.
 ROOMS = (
-    "mechanics",
+    "mechanics.kernels", "mechanics.reading", "mechanics",
     "drive_env.cia402", "drive_env.cores", "drive_env.default_device", "drive_env.held_signals",
     "drive_env.realtime_section",
     "drive_env.saved_state", "drive_env.whole_file", "drive_env.own_packages", "drive_env.programs",
@@ -42,7 +42,7 @@ MOST_LINES, MOST_ARGUMENTS = 60, 10
 LONG = {
     "drive_env/firmware/servo/power_stage.py power_stage",
     "drive_env/firmware/servo/power_stage.py refresh_winding", "mechanics/packed.py _new_plant",
-    "mechanics/stepping.py drive", "mechanics/stepping.py report", "mechanics/stepping.py rub",
+    "mechanics/stepping.py drive", "mechanics/stepping.py report",
 }  # fmt: skip
 MANY = {
     "drive_env/emulator/emulated_drives.py __init__", "drive_env/master/can_drives.py __init__",
@@ -78,8 +78,8 @@ def imported_by(module: str) -> set[str]:
 
 def room_of(name: str) -> str:
     """The room of a module."""
-    package = name.partition(".")[0]
-    return package if package in ("mechanics", "research") else ".".join(name.split(".")[:2])
+    room = ".".join(name.split(".")[:2])
+    return room if room in ROOMS else name.partition(".")[0]
 
 
 def test_no_module_imports_itself_through_others():
@@ -118,8 +118,8 @@ def test_a_class_has_its_name_alone():
     assert {name: where for name, where in homes.items() if len(where) > 1} == {}
 
 
-# Calls that read a file, or make something of what was read, without a limit. All go through mechanics/untrusted.py;
-# what else may read, and why it meets nothing that somebody else wrote.
+# Calls that read a file, or make something of what was read, without a limit. All go through
+# mechanics/reading/; what else may read, and why it meets nothing that somebody else wrote.
 READERS = {
     "tomllib.load", "tomllib.loads", "json.load", "json.loads", "yaml.load", "yaml.safe_load", "pickle.load",
     "pickle.loads", "np.load", "np.fromfile", "np.loadtxt", "np.genfromtxt", "zipfile.ZipFile", "zipfile.is_zipfile",
@@ -128,13 +128,13 @@ READERS = {
     "from_binary_path", "InferenceSession", "torch.load",
 }  # fmt: skip
 MAY_READ = {
-    "mechanics.untrusted": "the readers themselves",
-    "mechanics.model": "MuJoCo: ours here, those of others in mechanics/limited_child.py",
-    "mechanics.limited_child": "what its parent asks, /proc",
+    "mechanics.reading.untrusted": "the readers themselves",
+    "mechanics.model": "MuJoCo: ours here, those of others in mechanics/reading/limited_child.py",
+    "mechanics.reading.limited_child": "what its parent asks, /proc",
     "drive_env.pictures.scene": "MuJoCo: what mechanics/model.py has let pass",
-    "mechanics.compiled": "sources of ours",
+    "mechanics.kernels.compiled": "sources of ours",
     "tuning.runs.provenance": "sources of ours",
-    "mechanics.kernel_files": "the cache of kernels, in a folder of the user's own; pickles, as Numba's are",
+    "mechanics.kernels.kernel_files": "the cache of kernels, in a folder of the user's own; pickles, as Numba's are",
     "drive_env.cores": "/proc and /sys",
     "drive_env.whole_file": "the text that is about to be written",
     "drive_env.devices.new_device": "the template of ours",
@@ -144,8 +144,8 @@ MAY_READ = {
     "agents.hyperparameter_search": "files that were written a moment ago, in a folder of its own",
     "agents.training.training_table": "CSV of a text that was read within limits",
     "agents.training.learning_curve": "CSV of a text that was read within limits",
-    "agents.policies.onnx_policy": "a file that has been read, and acted within limits in mechanics/limited_child.py",
-    "drive_env.commands.recorded_frames": "in mechanics/limited_child.py",
+    "agents.policies.onnx_policy": "a file that has been read, and acted within limits in limited_child.py",
+    "drive_env.commands.recorded_frames": "in mechanics/reading/limited_child.py",
     "tuning.runs.shard_log": "frame by frame, each with its length",
     "tuning.runs.pools": "pickles of the user's own workers, as SECURITY.md says",
 }
@@ -175,7 +175,7 @@ def test_what_is_read_goes_through_the_readers_with_limits():
     found = {name: calls for name, nodes in modules().items() if (calls := readers_in(nodes))}
     ours = {name: calls for name, calls in found.items() if not name.startswith("research.")}
     assert {name: calls for name, calls in ours.items() if name not in MAY_READ} == {}, (
-        "read it by mechanics/untrusted.py, or say in MAY_READ why nobody else's file can be there"
+        "read it by mechanics/reading/untrusted.py, or say in MAY_READ why nobody else's file can be there"
     )
     assert set(MAY_READ) <= set(ours), "reads nothing now: take it from the list"
 

@@ -2,21 +2,86 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+from scipy.linalg import eigh
 
 from drive_env import EmulatedDrives
 from drive_env.devices import find_device
 from drive_env.devices.gains import rule_gains
 from drive_env.drives.raw_gains import write_gains
-from drive_env.loops.true_plant import linear_load, true_machines, true_plant
+from drive_env.emulator.emulated_drives import emulated_of
+from drive_env.loops.linear_model import Plant
+from drive_env.loops.sampled import RIGID
+from drive_env.loops.true_plant import LinearLoad, linear_load, terminal_resistance, true_machines
+from mechanics.arrays import Floats
 from mechanics.shaft import way
 from tuning.auto.identified import calm_gains
 from tuning.auto.proving import ProvingGround
-from tuning.compare.suite import (
-    groups,
-    open_group,
-)
+from tuning.compare.suite import groups, open_group
 from tuning.estimate import refused
+
+
+def true_plant(drives, axis: int = 0) -> Plant:
+    """Return the plant of an emulated axis, with its first resonance.
+
+    Raises:
+        ValueError: For drives on a bus, whose true parameters are unknown, and for a machine with several axes.
+    """
+    if drives.machine is None:
+        raise ValueError("the true parameters of a machine on a bus are unknown; identify it")
+    emulated = emulated_of(drives)  # without the observers around them
+    if emulated.load.num_axes != 1:
+        raise ValueError(f"load {emulated.load.name!r} couples {emulated.load.num_axes} axes; the model has one")
+    true = {name: float(values[axis]) for name, values in drives.machine.parameters.items()}
+    group = next(g for g in emulated.inside.groups if g.machines.start <= axis < g.machines.stop)
+    J, viscous, pair = _first_resonance(linear_load(group.load), axis - group.machines.start, group.load.load.name)
+    motor = emulated.motor
+    psi = true["motor.psi_m"]
+    factor = 1.0 if motor.kind == "dc" else 1.5
+    known = {} if pair is None else {"anti_resonance": pair[0], "resonance": pair[1], "damping": pair[2]}
+    return Plant(
+        R=float(terminal_resistance(true, motor.kind)),
+        L=true["motor.L_q"],
+        supply=float(drives.machine.supply[axis]),
+        torque_constant=factor * motor.n_p * psi,
+        emf_constant=motor.n_p * psi,
+        inertia=J,
+        viscous=viscous,
+        delay=1.0 / emulated.device.velocity_rate,
+        velocity_filter=true["stage.velocity_filter"],
+        counts=round(motor.encoder_counts * true["motor.encoder_interpolation"]),
+        **known,
+    )
+
+
+def _first_resonance(found: LinearLoad, copy: int, name: str) -> tuple[float, float, tuple[float, float, float] | None]:
+    """Return inertia and viscous friction at the rotor, and anti-resonance, resonance [Hz], damping of the first."""
+    M, D, K, rotor = found.M[copy], found.D[copy], found.K[copy], found.rotors[0]
+    squares, modes = _modes(M, K)
+    free = squares <= RIGID * max(squares.max(), 1.0)
+    turning = np.flatnonzero(free)
+    if turning.size != 1:
+        raise ValueError(f"load {name!r} has {turning.size} motions without a spring; the model has one")
+    rigid = modes[:, turning[0]]
+    swing = float(rotor @ rigid)
+    J, viscous = 1.0 / swing**2, float(rigid @ D @ rigid) / swing**2
+    if free.all():
+        return J, viscous, None
+    first = int(np.flatnonzero(~free)[0])
+    w = math.sqrt(squares[first])
+    # With the rotor held, what is left swings at the anti-resonances.
+    others = np.linalg.svd(rotor[None, :])[2][1:].T
+    locked, _ = _modes(others.T @ M @ others, others.T @ K @ others)
+    damping = float(modes[:, first] @ D @ modes[:, first]) / (2.0 * w)
+    return J, viscous, (math.sqrt(locked[0]) / (2.0 * math.pi), w / (2.0 * math.pi), damping)
+
+
+def _modes(M: Floats, K: Floats) -> tuple[Floats, Floats]:
+    """Return squared angular frequencies, ascending, and the modes of M q'' + K q = 0 with unit modal mass."""
+    squares, modes = eigh(K, M)
+    return np.asarray(squares), np.asarray(modes)
 
 
 def truth(drives, axis, offset):

@@ -10,7 +10,7 @@ import numpy as np
 from drive_env.firmware.cycle import mechanics_window, meet
 from drive_env.firmware.record import LANES
 from drive_env.firmware.servo.stages import FIRMWARE
-from mechanics.compiled import cached
+from mechanics.kernels.compiled import cached
 
 start_window, supervise, tick = FIRMWARE.start_window, FIRMWARE.supervise, FIRMWARE.tick
 

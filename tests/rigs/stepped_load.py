@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mechanics.compiled import cached
+from mechanics.kernels.compiled import cached
 from mechanics.stepping import step
 
 

@@ -1,7 +1,8 @@
 """What an emulator has inside, which no page and no master has told."""
 
 from drive_env.dictionary.aborts import ObjectAccessError
-from drive_env.firmware.record import LANES
+from drive_env.firmware.common.brake import CLOSED, WITH_OUTPUT, WITH_STAGE
+from drive_env.firmware.record import LANES, get_lanes
 from tuning.snapshot import DEVICE_OBJECTS, take_of
 
 # What an axis does, not what it is set to: the state, positions and what follows from them, signals. Where home is
@@ -40,3 +41,17 @@ def truth_of(drives):
         "is_on": bool(records["stage_on"].reshape(-1, LANES)[0, 0]),
         "speed": float(records["omega_m"].reshape(-1, LANES)[0, 0]),
     }
+
+
+def field(drives, name, part=0):
+    """A field of the record of every axis, shape (num_axes,)."""
+    return get_lanes(drives.inside.records, name, drives.num_axes, part).astype(float)
+
+
+def brake_is_closed(drives):
+    """Whether the brake of each axis holds, shape (num_axes,)."""
+    mode = field(drives, "brake_mode")
+    shut = (mode == WITH_STAGE) & (field(drives, "stage_on") == 0) | (mode == WITH_OUTPUT) & (
+        field(drives, "brake_opened") == 0
+    )
+    return (mode == CLOSED) | shut

@@ -112,11 +112,7 @@ def is_elastic(plant: Plant) -> bool:
 
 
 def twin_parameters(
-    device: Device,
-    motor: Motor,
-    known: Known,
-    world: MachineVariant = WORLDS[0],
-    lightest: float = INERTIA_RANGE[0],
+    device: Device, motor: Motor, known: Known, world: MachineVariant = WORLDS[0], lightest: float = INERTIA_RANGE[0]
 ) -> dict[str, float]:
     """Return the parameters of the emulated machine (one inertia or two masses) that matches the identification.
 

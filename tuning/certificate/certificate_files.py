@@ -13,16 +13,10 @@ import numpy as np
 
 from drive_env.whole_file import content_hash, files_to_be
 from mechanics.arrays import Floats
-from mechanics.untrusted import parse_json, read_text
+from mechanics.reading.untrusted import parse_json, read_text
 from tuning.certificate.certificate import FORMAT, HASH, STEPPER_FORMAT, Certificate, CertificateError
 from tuning.certificate.report import html_is_unchanged, to_html
 from tuning.runs.inputs import Input, write_inputs
-
-
-def save_certificate(certificate: Certificate, folder: str | Path) -> tuple[Path, Path]:
-    """Write certificate.json and report.html into a folder, made if needed, and return their paths."""
-    with certificate_files(certificate, folder) as paths:
-        return paths
 
 
 @contextmanager

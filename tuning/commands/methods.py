@@ -50,8 +50,7 @@ class MethodOptions:
 
     PANEL: ClassVar[str] = "How gains are found"
     rule: Annotated[
-        str | None,
-        typer.Option("--rule", help="With --by rule: the rule by name.", show_default=RULE_BY_DEFAULT),
+        str | None, typer.Option("--rule", help="With --by rule: the rule by name.", show_default=RULE_BY_DEFAULT)
     ] = None
     agent: Annotated[
         str | None,

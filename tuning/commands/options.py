@@ -80,8 +80,7 @@ Lockstep = Annotated[
     bool, typer.Option("--lockstep", help="Time passes by SYNC only, for an emulator that is served with --lockstep.")
 ]
 Supply = Annotated[
-    float | None,
-    typer.Option("--supply", help="Supply voltage at the drive [V].", show_default="the motor's"),
+    float | None, typer.Option("--supply", help="Supply voltage at the drive [V].", show_default="the motor's")
 ]
 TravelRange = Annotated[
     str | None,

@@ -92,12 +92,7 @@ def sweep(
 
 
 def _sweep(
-    config: Path | None,
-    overrides: dict[str, Any],
-    folder: Path,
-    workers: int | None,
-    cluster: str | None,
-    resume: bool,
+    config: Path | None, overrides: dict[str, Any], folder: Path, workers: int | None, cluster: str | None, resume: bool
 ) -> None:
     from rich.console import Console
 
@@ -233,7 +228,7 @@ def _print_best(result: Any, count: int) -> None:
 
 
 def _show_config(config: Path | None, overrides: dict[str, Any]) -> None:
-    from mechanics.untrusted import read_text
+    from mechanics.reading.untrusted import read_text
     from tuning.runs.experiment import load_experiment, shipped_experiment
 
     experiment = load_experiment(config, **overrides)

@@ -20,7 +20,7 @@ import numpy as np
 from drive_env.drives.observed import ObservedDrives
 from drive_env.loops.dynamics import DEFAULT
 from mechanics.arrays import Integers
-from mechanics.untrusted import parse_json
+from mechanics.reading.untrusted import parse_json
 from tuning.compare.oracle import Oracle, find_oracles
 from tuning.compare.suite import SuiteMachine, groups, open_group
 from tuning.compare.tuners import RuleTuner, find_tuner, identify_all

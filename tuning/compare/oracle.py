@@ -27,7 +27,7 @@ from drive_env.loops.dynamics import DEFAULT, Dynamics, find_dynamics
 from drive_env.loops.true_plant import terminal_resistance
 from drive_env.whole_file import write_table
 from mechanics.arrays import Floats, Integers, Mask
-from mechanics.untrusted import read_rows
+from mechanics.reading.untrusted import read_rows
 from tuning.auto.design import CURRENT_CROSSOVER, CURRENT_LAG, LEAST_TORQUE
 from tuning.compare.suite import SuiteMachine, groups
 from tuning.compare.yardstick import Yardstick

@@ -25,8 +25,8 @@ from drive_env.emulator.inertia_check import MisfitWarning
 from drive_env.motors import find_motor
 from drive_env.randomisation.random_machines import laws_of, shipped
 from mechanics.loads import MODEL_ENDINGS, find_load
+from mechanics.reading.untrusted import read_toml
 from mechanics.shaft import one, way
-from mechanics.untrusted import read_toml
 from tuning.linked_axes import are_linked
 from tuning.runs.inputs import files_of, is_path, is_shipped, taken
 from tuning.target import Target

@@ -384,13 +384,7 @@ def _average(results: list[_Solved], blocks: Integers) -> _Fit:
 
 
 def _solve(
-    X: Floats,
-    Z: Floats,
-    y: Floats,
-    blocks: Integers,
-    prior: Floats,
-    deviation: Floats,
-    count: float,
+    X: Floats, Z: Floats, y: Floats, blocks: Integers, prior: Floats, deviation: Floats, count: float
 ) -> _Solved:
     """Return coefficients, deviations for errors alike within a pulse, the rest's square, and the priors' misfit."""
     scale = np.maximum(np.sqrt(np.mean(X**2, axis=0)), 1e-15)

@@ -24,7 +24,7 @@ from drive_env.drives.speeds import per_increment_of
 from drive_env.motors import find_motor
 from mechanics.arrays import Integers
 from mechanics.loads import find_load
-from mechanics.untrusted import read_toml
+from mechanics.reading.untrusted import read_toml
 from tuning.runs.inputs import Input, as_kept, found_again, inputs_in, table_of, taken
 from tuning.runs.metrics import TRACKING, combined_of, metric_names
 from tuning.toml_tables import ExperimentError as ExperimentError

@@ -19,7 +19,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from mechanics.untrusted import TooLargeError, read_bytes
+from mechanics.reading.untrusted import TooLargeError, read_bytes
 
 FOLDER = "inputs"  # of a run
 MOST_BYTES = 64_000_000  # of an input with all its files: it travels with each task

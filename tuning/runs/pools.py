@@ -23,7 +23,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, TypeVar
 from urllib.parse import parse_qsl
 
 from tuning.runs import provenance
@@ -55,11 +55,11 @@ def _anything(_item: Any, _result: Any) -> bool:
     return True
 
 
-class Pool(Protocol):
+class Pool:
     """Somewhere for work to run."""
 
-    width: int  # tasks that run at a time, about
-    shares_disk: bool  # whether tasks can go on from files of this machine
+    width = 1  # tasks that run at a time, about
+    shares_disk = True  # whether tasks can go on from files of this machine
 
     def unordered(
         self,
@@ -80,9 +80,15 @@ class Pool(Protocol):
         Raises:
             PoolError: If a worker is lost, or gives back what is no result of its work; the message names it.
         """
+        return self._unordered(function, items, say, fits)
+
+    def _unordered(self, function: Any, items: Sequence[Any], say: Say, fits: Any) -> Iterator[tuple[int, Any]]:
+        for k, item in enumerate(items):
+            yield k, function(item)
 
     def differences(self) -> list[str]:
         """Return a line for each way in which the workers are not like this process: last digits may then differ."""
+        return []
 
 
 def in_order(pool: Pool, function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
@@ -120,42 +126,16 @@ def open_pool(workers: int | None = None, cluster: str | None = None, again: str
         finally:
             executor.shutdown(wait=True, cancel_futures=True)
     else:
-        yield _Here()
+        yield Pool()
 
 
-class _Here:
-    width = 1
-    shares_disk = True
-
-    def unordered(
-        self,
-        function: Callable[[Item], Result],
-        items: Sequence[Item],
-        say: Say = _silent,
-        fits: Callable[[Item, Result], bool] = _anything,
-    ) -> Iterator[tuple[int, Result]]:
-        for k, item in enumerate(items):
-            yield k, function(item)
-
-    def differences(self) -> list[str]:
-        return []
-
-
-class _Processes:
-    shares_disk = True
-
+class _Processes(Pool):
     def __init__(self, executor: ProcessPoolExecutor, width: int, again: str = AGAIN) -> None:
         self._executor = executor
         self.width = width
         self._again = again
 
-    def unordered(
-        self,
-        function: Callable[[Item], Result],
-        items: Sequence[Item],
-        say: Say = _silent,
-        fits: Callable[[Item, Result], bool] = _anything,
-    ) -> Iterator[tuple[int, Result]]:
+    def _unordered(self, function: Any, items: Sequence[Any], say: Say, fits: Any) -> Iterator[tuple[int, Any]]:
         packed = [pickle.dumps((function, item)) for item in items]
         futures = {self._executor.submit(_checked, provenance.SOURCES, work): k for k, work in enumerate(packed)}
         say(FIRST_RESULT)
@@ -173,11 +153,8 @@ class _Processes:
                 f"{self._again}"
             ) from None
 
-    def differences(self) -> list[str]:
-        return []
 
-
-class _Dask:
+class _Dask(Pool):
     shares_disk = False
 
     def __init__(self, client: Any, width: int, address: str = "", again: str = AGAIN) -> None:
@@ -187,13 +164,7 @@ class _Dask:
         self._again = again
         self._told: set[str] = set()
 
-    def unordered(
-        self,
-        function: Callable[[Item], Result],
-        items: Sequence[Item],
-        say: Say = _silent,
-        fits: Callable[[Item, Result], bool] = _anything,
-    ) -> Iterator[tuple[int, Result]]:
+    def _unordered(self, function: Any, items: Sequence[Any], say: Say, fits: Any) -> Iterator[tuple[int, Any]]:
         from concurrent.futures import CancelledError
 
         from distributed import as_completed as as_completed_there

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drive_env.whole_file import naming
-from mechanics.untrusted import MOST_ARRAYS, parse_json, read_arrays
+from mechanics.reading.untrusted import MOST_ARRAYS, parse_json, read_arrays
 from tuning.runs import provenance
 
 Arrays = dict[str, NDArray[Any]]

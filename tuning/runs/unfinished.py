@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from drive_env.whole_file import write_whole
-from mechanics.untrusted import read_toml
+from mechanics.reading.untrusted import read_toml
 from tuning.runs.inputs import Input, check_unchanged, write_inputs
 from tuning.runs.shard_log import ShardLog, ShardLogError
 

@@ -65,10 +65,7 @@ def description(shards: list[Search]) -> str:
 
 
 def run(
-    shards: list[Search],
-    pool: Pool | None,
-    log: ShardLog,
-    progress: Callable[[float], None] = lambda share: None,
+    shards: list[Search], pool: Pool | None, log: ShardLog, progress: Callable[[float], None] = lambda share: None
 ) -> list[Optimised]:
     """Run the searches that are not in the log yet, and return the results of all, in their order.
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from drive_env.devices import find_device
 from drive_env.whole_file import write_picture, write_whole
-from mechanics.untrusted import read_toml
+from mechanics.reading.untrusted import read_toml
 from tuning.runs.inputs import Input, as_kept, found_again, inputs_in, table_of, write_inputs
 from tuning.search.optimise import COST, Optimised, Settings, TrialRow, pareto
 from tuning.search.trial_bench import OBJECTIVES

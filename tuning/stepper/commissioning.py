@@ -60,12 +60,7 @@ def check_stepper(target: Target) -> None:
 
 
 def commission(
-    target: Target,
-    file: str | Path,
-    *,
-    keep: bool = True,
-    progress: Progress | None = None,
-    files: Files = nullcontext,
+    target: Target, file: str | Path, *, keep: bool = True, progress: Progress | None = None, files: Files = nullcontext
 ) -> StepperResult:
     """Commission the axes of a target; an axis that fails a check is rolled back, and the reason is in the result.
 

@@ -20,7 +20,7 @@ from agents.tasks import environment_name, row_of
 from agents.training.algorithms import ALGORITHMS, NOT_TAKEN, SAME_HYPERPARAMETERS
 from drive_env.envs import environment_of
 from drive_env.envs.suite import TASKS
-from mechanics.untrusted import check_table, read_text
+from mechanics.reading.untrusted import check_table, read_text
 
 FOLDER = Path(__file__).parent
 PRESETS = ("quick", "full")

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mechanics.compiled import inlined
+from mechanics.kernels.compiled import inlined
 
 TWO_PI = 2.0 * np.pi
 # pi/2 in three parts whose products with small integers are exact (Cody and Waite).

@@ -13,7 +13,7 @@ output's largest, and closes some time after it has fallen below the drop-out sh
 
 from __future__ import annotations
 
-from mechanics.compiled import stage
+from mechanics.kernels.compiled import stage
 
 LARGEST = 255.0  # of an output's current
 PULL_IN, DROP_OUT = 0.6, 0.2  # of the output's largest current; usual for brakes with a spring

@@ -6,7 +6,18 @@ A condition is asked once per supervision period: `told` says whether the cause 
 from __future__ import annotations
 
 from drive_env.firmware.common import inputs, limits
-from mechanics.compiled import stage
+from drive_env.firmware.common.protection import (
+    BLOCKS_NEGATIVE,
+    BLOCKS_POSITIVE,
+    COMMUNICATION,
+    FAULT_RESET,
+    LIMIT,
+    LIMIT_REGISTER,
+    STOP,
+    WARN,
+    Cause,
+)
+from mechanics.kernels.compiled import stage
 
 HOMING = 6  # limit switches are what homing looks for
 
@@ -81,3 +92,16 @@ def positive_switch(drive, lane, told):
 def negative_switch(drive, lane, told):
     """Return whether the left limit switch is active."""
     return _limits_count(drive, lane) and inputs.is_active(drive, lane, 0)
+
+
+# The last rows of every drive with limit switches of its own.
+LIMITS_AND_NETWORK = (
+    Cause("positive_software_limit", LIMIT, LIMIT_REGISTER, 0x0, above_limit, BLOCKS_POSITIVE, software=True),
+    Cause("negative_software_limit", LIMIT, LIMIT_REGISTER, 0x0, below_limit, BLOCKS_NEGATIVE, software=True),
+    Cause("positive_limit_switch", LIMIT, LIMIT_REGISTER, 0x0, positive_switch, BLOCKS_POSITIVE),
+    Cause("negative_limit_switch", LIMIT, LIMIT_REGISTER, 0x0, negative_switch, BLOCKS_NEGATIVE),
+    # From outside the axis: its network was stopped or lost.
+    Cause(COMMUNICATION, STOP, 0x10, 0x0),
+    # The axis has left its limits: 0000h too, as CiA 301 has it, but no command, and nothing else ends with it.
+    Cause(FAULT_RESET, WARN, 0x00, 0x0),
+)

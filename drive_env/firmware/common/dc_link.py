@@ -1,9 +1,9 @@
-"""The DC link between supply and bridge: its fields, the constants of a tick, and its voltage after one."""
+"""The DC link between supply and bridge: its fields, a tick's constants, and what a tick does to link and rotor."""
 
 from __future__ import annotations
 
 from drive_env.firmware.record import LANES, Field
-from mechanics.compiled import inlined
+from mechanics.kernels.compiled import inlined
 
 SMALLEST_RESISTANCE = 1e-15  # ohm; a supply without resistance is one that holds its voltage
 SMALLEST_VOLTAGE = 1e-3  # V; an empty DC link divides nothing
@@ -45,22 +45,35 @@ def derive_link(drive, dt):
 
 
 @inlined
-def link_voltage(left, decay, feed, share, supply, sinks):
-    """Return the voltage of the link after a tick [V].
+def drain_link(drive, lane, drained):
+    """Take a current [A] from the link for a tick: writes u_dc [V].
 
     The source feeds through a diode, so braking charges the link, unless it is one that sinks current, too. A short
     circuit is implicit: it may empty the link within a tick.
+    """
+    left = drive.u_dc[lane] - drive.link_step[lane] * drained
+    supply = drive.supply_voltage[lane]
+    blocked = left * drive.link_decay[lane]
+    fed = (left + drive.link_feed[lane] * supply) * drive.link_share[lane]
+    floor = supply if drive.supply_sinks[lane] < 0.5 else ENDLESS
+    link = fed if blocked < floor else blocked
+    drive.u_dc[lane] = link if link > SMALLEST_VOLTAGE else SMALLEST_VOLTAGE
+
+
+@inlined
+def turn_rotor(drive, lane, torque, dt, progress):
+    """Move the rotor on through a tick: writes omega_m and theta_m.
 
     Args:
-        left: Voltage that the drained current leaves [V].
-        decay: link_decay of the record.
-        feed: link_feed.
-        share: link_share.
-        supply: Open-circuit voltage of the supply [V].
-        sinks: 1: it takes power back.
+        drive: The record.
+        lane: Of the axis.
+        torque: Of the motor [N*m], without the load's reaction.
+        dt: Current-loop period [s].
+        progress: Middle of this tick, as a share of the window, plus one half: the load's reaction is extrapolated
+            from the middles of the last two windows to it.
     """
-    blocked = left * decay
-    fed = (left + feed * supply) * share
-    floor = supply if sinks < 0.5 else ENDLESS
-    link = fed if blocked < floor else blocked
-    return link if link > SMALLEST_VOLTAGE else SMALLEST_VOLTAGE
+    reaction = drive.tau_reaction[lane] + progress * (drive.tau_reaction[lane] - drive.tau_reaction_before[lane])
+    omega = drive.omega_m[lane]
+    new_omega = omega + drive.tick_mobility[lane] * (torque - reaction)
+    drive.omega_m[lane] = new_omega
+    drive.theta_m[lane] += 0.5 * dt * (omega + new_omega)

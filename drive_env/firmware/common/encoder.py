@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from drive_env.firmware.common.arithmetic import TWO_PI, sine_cosine
 from drive_env.firmware.record import LANES, Field
-from mechanics.compiled import inlined
+from mechanics.kernels.compiled import inlined
 
 U32 = np.uint32  # without it every operation of the generator widens to 64 bits
 # Sum of four random bytes: mean 510, variance 4 (256^2 - 1) / 12.
@@ -64,3 +65,91 @@ def encoder_count(edges, backwards):
     """
     count = np.floor(edges)
     return count + backwards * (-1.0 - 2.0 * count)
+
+
+@inlined
+def derive_counter(drive, lane):
+    """Compute the quotients of the encoder: writes turns_per_count and counts_per_rad."""
+    # 2080h:02 and 608Fh may be 0, which is no encoder that could be counted with.
+    steps = drive.encoder_steps[lane] * drive.encoder_interpolation[lane]
+    steps = steps if steps > 0.0 else 1.0
+    drive.turns_per_count[lane] = (1.0 - 2.0 * drive.encoder_direction[lane]) / steps
+    drive.counts_per_rad[lane] = drive.encoder_counts[lane] * (1.0 / TWO_PI) * drive.encoder_gain[lane]
+
+
+@inlined
+def count_at(drive, lane, angle):
+    """Return what the counter shows at an angle of the disc [rad]; that of an encoder that is broken stands still."""
+    count = encoder_count(angle * drive.counts_per_rad[lane], drive.encoder_true_direction[lane])
+    return drive.count[lane] if drive.encoder_broken[lane] > 0.5 else count
+
+
+@inlined
+def read_counter(drive, lane):
+    """Find the disc's error, and return what the counter shows now."""
+    s, _ = sine_cosine(drive.theta_m[lane] + drive.encoder_line_phase[lane])
+    drive.encoder_error[lane] = drive.encoder_line_error[lane] * s + drive.encoder_shake[lane]
+    return count_at(drive, lane, drive.theta_m[lane] + drive.encoder_error[lane])
+
+
+@inlined
+def forget_velocity(drive, lane):
+    """Begin the velocity filter anew."""
+    drive.velocity_filter_z[0, lane] = 0.0
+    drive.velocity_filter_z[1, lane] = 0.0
+
+
+@inlined
+def start_counter(drive, lane):
+    """Begin counting where the disc stands, and return its edges there."""
+    forget_velocity(drive, lane)
+    s, _ = sine_cosine(drive.theta_m[lane] + drive.encoder_line_phase[lane])
+    drive.encoder_error[lane] = drive.encoder_line_error[lane] * s
+    edges = (drive.theta_m[lane] + drive.encoder_error[lane]) * drive.encoder_counts[lane] / TWO_PI
+    drive.count[lane] = encoder_count(edges * drive.encoder_gain[lane], drive.encoder_true_direction[lane])
+    drive.count_zero[lane] = drive.count[lane]
+    return edges
+
+
+@inlined
+def find_noise(drive):
+    """Write whether a lane of the block has a noisy encoder."""
+    drive.block_has_noisy_encoder[0] = 0
+    for lane in range(LANES):
+        # Once more after the noise has ended, so that none of it is left in the angle.
+        if drive.encoder_noise[lane] > 0.0 or drive.encoder_shake[lane] != 0.0:
+            drive.block_has_noisy_encoder[0] = 1
+
+
+@inlined
+def filtered_velocity(drive, lane, raw):
+    """Return a velocity [rad/s] after the second-order low-pass, whose state it moves on by a window."""
+    b = drive.velocity_filter_b[lane]
+    omega = b * raw + drive.velocity_filter_z[0, lane]
+    drive.velocity_filter_z[0, lane] = (
+        2.0 * b * raw - drive.velocity_filter_a[0, lane] * omega + drive.velocity_filter_z[1, lane]
+    )
+    drive.velocity_filter_z[1, lane] = b * raw - drive.velocity_filter_a[1, lane] * omega
+    return omega
+
+
+@inlined
+def index_in_window(drive, lane, edges, first, up):
+    """Return whether the index came in the window that has passed, at which edge, and the count there.
+
+    Args:
+        drive: The record.
+        lane: Of the axis.
+        edges: Of the disc at its present angle.
+        first: Edge at which the index becomes active in that direction, of any turn.
+        up: 1: it turned upwards, or stood; 0: downwards.
+    """
+    counts = drive.encoder_counts[lane]
+    before = drive.true_edges[lane]
+    turn = np.floor((edges - first) / counts)
+    turn_before = np.floor((before - first) / counts)
+    sees = drive.encoder_broken[lane] < 0.5 and drive.encoder_gain[lane] > 0.0
+    came = sees and turn != turn_before
+    at = first + counts * (turn if turn > turn_before else turn_before)
+    count = encoder_count(at * drive.encoder_gain[lane] + up - 0.5, drive.encoder_true_direction[lane])
+    return came, at, count

@@ -14,7 +14,7 @@ from drive_env import cia402
 from drive_env.cia402 import STATE_CODING, Pattern, State
 from drive_env.firmware.common import brake, start_up
 from drive_env.firmware.record import EMERGENCY_QUEUE
-from mechanics.compiled import stage
+from mechanics.kernels.compiled import stage
 
 SHUTDOWN = cia402.COMMANDS["shutdown"]
 SWITCH_ON = cia402.COMMANDS["switch on"]
@@ -23,7 +23,6 @@ DISABLE_VOLTAGE = cia402.COMMANDS["disable voltage"]
 QUICK_STOP = cia402.COMMANDS["quick stop"]
 DISABLE_OPERATION = cia402.COMMANDS["disable operation"]
 FAULT_RESET = cia402.COMMANDS["fault reset"]  # on the rising edge only
-AUTOMATIC = Pattern(0, 0)
 
 
 class Transition(NamedTuple):
@@ -53,13 +52,6 @@ TRANSITIONS = (
     Transition(12, State.QUICK_STOP_ACTIVE, DISABLE_VOLTAGE, State.SWITCH_ON_DISABLED),
     Transition(15, State.FAULT, FAULT_RESET, State.SWITCH_ON_DISABLED),
     Transition(16, State.QUICK_STOP_ACTIVE, ENABLE_OPERATION, State.OPERATION_ENABLED),
-)
-# Transitions that no command makes: power-on (0, 1), the end of a quick stop ramp (12), faults (13, 14).
-AUTOMATIC_TRANSITIONS = (
-    Transition(1, State.NOT_READY_TO_SWITCH_ON, AUTOMATIC, State.SWITCH_ON_DISABLED),
-    Transition(12, State.QUICK_STOP_ACTIVE, AUTOMATIC, State.SWITCH_ON_DISABLED),
-    Transition(13, State.OPERATION_ENABLED, AUTOMATIC, State.FAULT_REACTION_ACTIVE),
-    Transition(14, State.FAULT_REACTION_ACTIVE, AUTOMATIC, State.FAULT),
 )
 
 _ROWS = np.array([(t.number, t.start, t.command.mask, t.command.value, t.end) for t in TRANSITIONS], np.int32)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mechanics.compiled import stage
+from mechanics.kernels.compiled import stage
 
 LEFT, RIGHT, HOME, ENABLE = 1, 2, 4, 8
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mechanics.compiled import stage
+from mechanics.kernels.compiled import stage
 
 ROUNDING = 1e-9  # rad: a target at the corrected limit itself is within it
 # rad, one degree of the rotor: an axis that is held at its limit moves by less, and is not told of.

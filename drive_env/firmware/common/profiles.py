@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-from mechanics.compiled import stage
+from mechanics.kernels.compiled import stage
 
 
 @stage

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 from drive_env import cia402
 from drive_env.firmware.common import fsa, limits
-from mechanics.compiled import inlined, stage
+from mechanics.kernels.compiled import inlined, stage
 
 CUT, STOP, LIMIT, WARN = 0, 1, 2, 3
 BLOCKS_NEGATIVE, BLOCKS_POSITIVE = 1, 2

@@ -15,7 +15,7 @@ so that a changed target, speed, ramp or bow needs no case. Whatever has to turn
 from __future__ import annotations
 
 from drive_env.firmware.common.arithmetic import TWO_PI
-from mechanics.compiled import stage
+from mechanics.kernels.compiled import stage
 
 MOST_PARTS = 6  # of a way within one period: braked, turned round and begun anew
 NEAR = 1e-9  # rad: at the target but for rounding

@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import math
 
-from mechanics.compiled import stage
+from mechanics.kernels.compiled import stage
 
 SINE, SINE_SQUARE, EARLY, LATE = 0, 1, 2, 3
 MOST_PARTS = 4  # of a way within one period: brought to rest, turned round and begun anew

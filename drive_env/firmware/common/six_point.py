@@ -15,7 +15,7 @@ a period: the times at which one ramp goes over into the next are found, not sam
 
 from __future__ import annotations
 
-from mechanics.compiled import stage
+from mechanics.kernels.compiled import stage
 
 MOST_PARTS = 12  # of a ramp, within one period: reversed on the way, braked, waited for, and begun anew
 NEAR = 1e-9  # rad: at the target but for rounding

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mechanics.compiled import stage
+from mechanics.kernels.compiled import stage
 
 NEEDED, FIRST_ANGLE, SECOND_ANGLE, DONE, FAILED = 0, 1, 2, 3, 4
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from drive_env.firmware.record import Field
 from drive_env.motors import COPPER
-from mechanics.compiled import inlined
+from mechanics.kernels.compiled import inlined
 
 NOMINAL = 25.0  # degC at which the motor's row holds
 

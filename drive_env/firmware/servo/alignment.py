@@ -8,7 +8,7 @@ offset knows the alignment from before.
 from __future__ import annotations
 
 from drive_env.firmware.common.start_up import DONE, FAILED, FIRST_ANGLE, NEEDED, SECOND_ANGLE, is_busy
-from mechanics.compiled import stage
+from mechanics.kernels.compiled import stage
 
 TWO_PI = 6.283185307179586
 QUARTER = 0.25 * TWO_PI

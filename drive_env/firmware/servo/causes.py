@@ -3,23 +3,11 @@
 from __future__ import annotations
 
 from drive_env.firmware.common import causes, fsa, start_up
-from drive_env.firmware.common.protection import (
-    BLOCKS_NEGATIVE,
-    BLOCKS_POSITIVE,
-    COMMUNICATION,
-    CUT,
-    FAULT_RESET,
-    FOLLOWING_ERROR,
-    LIMIT,
-    LIMIT_REGISTER,
-    STOP,
-    WARN,
-    Cause,
-)
+from drive_env.firmware.common.phases import open_load_a, open_load_b
+from drive_env.firmware.common.protection import CUT, FAULT_RESET, FOLLOWING_ERROR, STOP, WARN, Cause
 from drive_env.firmware.servo import alignment
-from mechanics.compiled import stage
+from mechanics.kernels.compiled import stage
 
-OPEN_LOAD_TIME = 0.05  # s for which a phase must stay without the current that is asked for
 OPEN_LOAD_DEMAND = 1.0  # A of phase current that must be asked for
 OPEN_LOAD_CURRENT = 0.3  # A below which there is none
 SQRT3 = 3.0**0.5
@@ -48,13 +36,6 @@ def watch_phases(drive, lane, dt):
         drive.open_load_time_b[lane] += dt
     elif not on or drive.peak_b[lane] >= OPEN_LOAD_CURRENT:
         drive.open_load_time_b[lane] = 0.0
-
-
-@stage
-def forget_peaks(drive, lane, dt):
-    """Begin the next period's largest currents, after protection has looked at this one's."""
-    drive.peak_a[lane] = 0.0
-    drive.peak_b[lane] = 0.0
 
 
 @stage
@@ -89,18 +70,6 @@ def initialization_failed(drive, lane, told):
 
 
 @stage
-def open_load_a(drive, lane, told):
-    """Return whether phase A has carried no current for long, although it should."""
-    return drive.open_load_time_a[lane] > OPEN_LOAD_TIME
-
-
-@stage
-def open_load_b(drive, lane, told):
-    """Return whether phase B has carried no current for long, although it should."""
-    return drive.open_load_time_b[lane] > OPEN_LOAD_TIME
-
-
-@stage
 def overload(drive, lane, told):
     """Return whether the stage's I2t budget is used up."""
     return drive.overload[lane] > 1.0
@@ -124,12 +93,5 @@ CAUSES = (
     Cause(FOLLOWING_ERROR, STOP, 0x20, 0x0, causes.following_error),
     Cause("overload", STOP, 0x02, 0x20000, overload, held=True),
     Cause("overtemperature_warning", WARN, 0x08, 0x0, causes.warm),
-    Cause("positive_software_limit", LIMIT, LIMIT_REGISTER, 0x0, causes.above_limit, BLOCKS_POSITIVE, software=True),
-    Cause("negative_software_limit", LIMIT, LIMIT_REGISTER, 0x0, causes.below_limit, BLOCKS_NEGATIVE, software=True),
-    Cause("positive_limit_switch", LIMIT, LIMIT_REGISTER, 0x0, causes.positive_switch, BLOCKS_POSITIVE),
-    Cause("negative_limit_switch", LIMIT, LIMIT_REGISTER, 0x0, causes.negative_switch, BLOCKS_NEGATIVE),
-    # From outside the axis: its network was stopped or lost.
-    Cause(COMMUNICATION, STOP, 0x10, 0x0),
-    # The axis has left its limits: 0000h too, as CiA 301 has it, but no command, and nothing else ends with it.
-    Cause(FAULT_RESET, WARN, 0x00, 0x0),
+    *causes.LIMITS_AND_NETWORK,
 )

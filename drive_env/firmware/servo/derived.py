@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from drive_env.firmware.common.arithmetic import TWO_PI
 from drive_env.firmware.common.dc_link import derive_link
+from drive_env.firmware.common.encoder import derive_counter
 from drive_env.firmware.record import LANES
-from mechanics.compiled import inlined
+from mechanics.kernels.compiled import inlined
 
 
 @inlined
 def derive_sensors(drive):
     """Compute the constants of encoder, current sensor and flux regulator."""
     for lane in range(LANES):
-        # 2080h:02 may be 0, which is no encoder that could be counted with.
-        steps = drive.encoder_steps[lane] * drive.encoder_interpolation[lane]
-        steps = steps if steps > 0.0 else 1.0
-        drive.turns_per_count[lane] = (1.0 - 2.0 * drive.encoder_direction[lane]) / steps
-        drive.counts_per_rad[lane] = drive.encoder_counts[lane] * (1.0 / TWO_PI) * drive.encoder_gain[lane]
+        derive_counter(drive, lane)
         drive.adc_steps_per_ampere[lane] = 1.0 / drive.adc_step[lane]
         drive.ampere_per_lsb[lane] = drive.adc_step[lane] / drive.adc_step_lsb[lane]
         drive.dead_time_slope[lane] = 1.0 / drive.dead_time_current[lane]

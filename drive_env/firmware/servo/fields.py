@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from drive_env.firmware.common import dc_link, encoder, warming
+from drive_env.firmware.common import dc_link, encoder, phases, warming
 from drive_env.firmware.record import Field
 
 PARAMETERS = (
     *encoder.PARAMETERS,
     *dc_link.PARAMETERS,
     *warming.PARAMETERS,
+    *phases.PARAMETERS,
     # --- parameters and commands that the dictionary writes -------------------------------------------------------
     Field("current_p", "f8", "1/A", "2041h:01: duty per A of current error"),
     Field("current_i", "f8", "1", "2041h:02: share of P * error that the integrator takes per sample"),
@@ -64,9 +65,6 @@ PARAMETERS = (
     Field("hall_broken", "f8", "", "1: the halls' cable is broken, all lines read high"),
     Field("n_p", "f8", "", "pole pairs", 1.0),
     Field("commutation_offset", "f8", "rad", "error of the electrical angle after alignment"),
-    # Faults that come and go (drive_env/faults); a sound machine has the initial values.
-    Field("open_a", "f8", "", "1: the cable of phase A is broken"),
-    Field("open_b", "f8", "", "1: the cable of phase B is broken"),
     Field("open_c", "f8", "", "1: the cable of phase C is broken; a DC motor has none"),
     Field("cogging_torque", "f8", "N*m", "amplitude"),
     Field("cogging_order", "f8", "1/rev", "periods per turn"),
@@ -77,13 +75,12 @@ STATE = (
     *encoder.STATE,
     *dc_link.STATE,
     *warming.STATE,
+    *phases.STATE,
     # --- state: finite state automaton, profile -------------------------------------------------------------------
     Field("status_flags", "i4", "", "2101h"),
     Field("init_time", "f8", "s", "time in this state"),
     Field("init_angle", "f8", "rad", "rotor angle, as the encoder tells it, at the beginning of this state"),
     Field("overload", "f8", "1", "I2t: share of the overload budget that is used"),
-    Field("open_load_time_a", "f8", "s", "time for which phase A carried no current although it should"),
-    Field("open_load_time_b", "f8", "s", "the same of phase B"),
     Field("block_uses_halls", "i4", "", "lane 0: 1 if a lane of this block commutates by halls"),
     Field("block_looks_for_index", "i4", "", "lane 0: 1 if a lane of this block is homing"),
     Field("block_has_open_phase", "i4", "", "lane 0: 1 if a lane of this block has a broken phase"),
@@ -120,12 +117,8 @@ STATE = (
     Field("torque_meas", "f8", "A", "6077h: measured torque current, user's direction"),
     Field("random", "f8", "", "state of the noise generator, an unsigned 32-bit integer", 1.0),
     # --- state: power stage and motor -----------------------------------------------------------------------------
-    Field("sin_e", "f8", "1", "sine of the true electrical angle at the tick's start"),
-    Field("cos_e", "f8", "1", "", 1.0),
     Field("sin_meas", "f8", "1", "sine of the electrical angle that the encoder tells"),
     Field("cos_meas", "f8", "1", "", 1.0),
-    Field("peak_a", "f8", "A", "largest measured current of phase A since protection looked last"),
-    Field("peak_b", "f8", "A", "the same of phase B"),
     Field("i_alpha_meas", "f8", "A", "measured current, stator frame"),
     Field("i_beta_meas", "f8", "A", ""),
     Field("duty_next_alpha", "f8", "1", "duty computed in this period, held in the next"),
@@ -142,8 +135,6 @@ STATE = (
     Field("i_q_mean", "f8", "A", ""),
     Field("u_d", "f8", "V", "held by the bridge, rotor frame at the tick's start"),
     Field("u_q", "f8", "V", ""),
-    Field("half_turn_sin", "f8", "1", "sine of half the electrical angle that the rotor turns in a tick"),
-    Field("half_turn_cos", "f8", "1", "", 1.0),
     Field("chopper", "f8", "", "1: the brake chopper conducts"),
     Field("i_d", "f8", "A", ""),
     Field("i_q", "f8", "A", ""),

@@ -9,10 +9,10 @@ from __future__ import annotations
 import numpy as np
 
 from drive_env.firmware.common.arithmetic import TWO_PI
-from drive_env.firmware.common.encoder import encoder_count
+from drive_env.firmware.common.encoder import index_in_window
 from drive_env.firmware.common.modes import hm
 from drive_env.firmware.record import LANES
-from mechanics.compiled import inlined, stage
+from mechanics.kernels.compiled import inlined, stage
 
 
 @stage
@@ -34,15 +34,9 @@ def watch_index(drive):
     for lane in range(LANES):
         counts = drive.encoder_counts[lane]
         edges = (drive.theta_m[lane] + drive.encoder_error[lane]) * counts * (1.0 / TWO_PI)
-        before = drive.true_edges[lane]
-        up = 1.0 if edges >= before else 0.0
+        up = 1.0 if edges >= drive.true_edges[lane] else 0.0
         first = np.floor(drive.index_angle[lane] * counts * (1.0 / TWO_PI)) + 1.0 - up
-        turn = np.floor((edges - first) / counts)
-        turn_before = np.floor((before - first) / counts)
-        sees = drive.encoder_broken[lane] < 0.5 and drive.encoder_gain[lane] > 0.0
-        came = sees and turn != turn_before
-        at = first + counts * (turn if turn > turn_before else turn_before)
-        count = encoder_count(at * drive.encoder_gain[lane] + up - 0.5, drive.encoder_true_direction[lane])
+        came, _, count = index_in_window(drive, lane, edges, first, up)
         per_count = (1.0 - 2.0 * drive.shaft_direction[lane]) * TWO_PI * drive.turns_per_count[lane]
         by_encoder = (count - drive.count_zero[lane]) * per_count - drive.home_shift[lane]
         # Under hall commutation the halls may be what tells the position.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from drive_env.firmware.common.arithmetic import between, clip
 from drive_env.firmware.record import LANES
-from mechanics.compiled import inlined
+from mechanics.kernels.compiled import inlined
 
 
 @inlined

@@ -13,9 +13,9 @@ The matrices change with speed only and are refreshed once per window. A DC moto
 from __future__ import annotations
 
 from drive_env.firmware.common.arithmetic import clip, cosine_series, exponential, sine_series
-from drive_env.firmware.common.dc_link import link_voltage
+from drive_env.firmware.common.dc_link import drain_link, turn_rotor
 from drive_env.firmware.record import LANES
-from mechanics.compiled import inlined
+from mechanics.kernels.compiled import inlined
 
 SQRT3 = 3.0**0.5
 
@@ -224,53 +224,41 @@ def open_phases(drive):
 
 
 @inlined
+def find_torque(drive, lane):
+    """Turn the tick's mean currents into torque and power: writes tau_m and bridge_power."""
+    mean_d = drive.i_d_mean[lane]
+    mean_q = drive.i_q_mean[lane]
+    change = (drive.i_d[lane] - drive.i_d_before[lane]) * (drive.i_q[lane] - drive.i_q_before[lane])
+    # mean(i_d i_q) of currents that change linearly within the tick.
+    mean_dq = mean_d * mean_q + change * (1.0 / 12.0)
+    drive.tau_m[lane] = (
+        drive.phase_factor[lane]
+        * drive.n_p[lane]
+        * (drive.psi_m[lane] * mean_q + (drive.L_d[lane] - drive.L_q[lane]) * mean_dq)
+    )
+    # The held voltage, as the rotor frame sees it in the middle of the tick, times the mean current.
+    half_s = drive.half_turn_sin[lane]
+    half_c = drive.half_turn_cos[lane]
+    mid_d = half_c * drive.u_d[lane] + half_s * drive.u_q[lane]
+    mid_q = half_c * drive.u_q[lane] - half_s * drive.u_d[lane]
+    drive.bridge_power[lane] = drive.phase_factor[lane] * (mid_d * mean_d + mid_q * mean_q)
+
+
+@inlined
 def convert_energy(drive, dt, progress):
     """Turn the tick's mean currents into torque and supply current: writes tau_m, u_dc, and moves the rotor on.
 
-    Args:
-        drive: The record.
-        dt: Current-loop period [s].
-        progress: Middle of this tick, as a share of the window, plus one half: the load's reaction is extrapolated
-            from the middles of the last two windows to it.
+    Ticks are of dt [s]; `progress` is that of `turn_rotor`.
     """
     for lane in range(LANES):
+        find_torque(drive, lane)
         u_dc = drive.u_dc[lane]
-        mean_d = drive.i_d_mean[lane]
-        mean_q = drive.i_q_mean[lane]
-        change = (drive.i_d[lane] - drive.i_d_before[lane]) * (drive.i_q[lane] - drive.i_q_before[lane])
-        # mean(i_d i_q) of currents that change linearly within the tick.
-        mean_dq = mean_d * mean_q + change * (1.0 / 12.0)
-        tau = (
-            drive.phase_factor[lane]
-            * drive.n_p[lane]
-            * (drive.psi_m[lane] * mean_q + (drive.L_d[lane] - drive.L_q[lane]) * mean_dq)
-        )
-        drive.tau_m[lane] = tau
-        # Power from the DC link: the held voltage, as the rotor frame sees it in the middle of the tick, times the mean
-        # current. What braking charges the link
-        # with the chopper alone takes away.
-        half_s = drive.half_turn_sin[lane]
-        half_c = drive.half_turn_cos[lane]
-        mid_d = half_c * drive.u_d[lane] + half_s * drive.u_q[lane]
-        mid_q = half_c * drive.u_q[lane] - half_s * drive.u_d[lane]
-        power = drive.phase_factor[lane] * (mid_d * mean_d + mid_q * mean_q)
-        drive.bridge_power[lane] = power
+        # What braking charges the link with the chopper alone takes away.
         limit = drive.chopper_voltage[lane]
         chopper = drive.chopper[lane]
         chopper = 0.0 if u_dc < limit - drive.chopper_hysteresis[lane] else chopper
         chopper = drive.chopper_enable[lane] if u_dc > limit else chopper
         drive.chopper[lane] = chopper
-        drained = drive.idle_current[lane] + power / u_dc + u_dc * chopper * drive.chopper_conductance[lane]
-        drive.u_dc[lane] = link_voltage(
-            u_dc - drive.link_step[lane] * drained,
-            drive.link_decay[lane],
-            drive.link_feed[lane],
-            drive.link_share[lane],
-            drive.supply_voltage[lane],
-            drive.supply_sinks[lane],
-        )
-        reaction = drive.tau_reaction[lane] + progress * (drive.tau_reaction[lane] - drive.tau_reaction_before[lane])
-        omega = drive.omega_m[lane]
-        new_omega = omega + drive.tick_mobility[lane] * (tau + drive.tau_cogging[lane] - reaction)
-        drive.omega_m[lane] = new_omega
-        drive.theta_m[lane] += 0.5 * dt * (omega + new_omega)
+        burnt = u_dc * chopper * drive.chopper_conductance[lane]
+        drain_link(drive, lane, drive.idle_current[lane] + drive.bridge_power[lane] / u_dc + burnt)
+        turn_rotor(drive, lane, drive.tau_m[lane] + drive.tau_cogging[lane], dt, progress)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from drive_env.firmware.common.arithmetic import TWO_PI, sine_cosine
-from drive_env.firmware.common.encoder import BYTES_MEAN, BYTES_SCALE, U32, encoder_count
+from drive_env.firmware.common.encoder import BYTES_MEAN, BYTES_SCALE, U32, count_at, filtered_velocity, read_counter
+from drive_env.firmware.common.phases import note_peaks
 from drive_env.firmware.record import LANES
-from mechanics.compiled import inlined, stage
+from mechanics.kernels.compiled import inlined, stage
 
 SQRT3 = 3.0**0.5
 PI = 3.141592653589793
@@ -23,12 +24,8 @@ def measure_motion(drive, h):
     at 4096 counts and 5 kHz it is 73 rpm before the filter.
     """
     for lane in range(LANES):
-        s, _ = sine_cosine(drive.theta_m[lane] + drive.encoder_line_phase[lane])
-        drive.encoder_error[lane] = drive.encoder_line_error[lane] * s + drive.encoder_shake[lane]
-        edges = (drive.theta_m[lane] + drive.encoder_error[lane]) * drive.counts_per_rad[lane]
-        count = encoder_count(edges, drive.encoder_true_direction[lane])
+        count = read_counter(drive, lane)
         before = drive.count[lane]
-        count = before if drive.encoder_broken[lane] > 0.5 else count
         shaft = 1.0 - 2.0 * drive.shaft_direction[lane]
         per_count = shaft * TWO_PI * drive.turns_per_count[lane]
         # Under hall commutation the halls are the encoder, unless 2043h:03 says otherwise: 6 steps per pole pair, speed
@@ -49,13 +46,7 @@ def measure_motion(drive, h):
         position = hall_position if by_hall > 0.5 else position
         drive.count[lane] = count
         drive.theta_meas[lane] = position - drive.home_shift[lane]
-        b = drive.velocity_filter_b[lane]
-        omega = b * raw + drive.velocity_filter_z[0, lane]
-        drive.velocity_filter_z[0, lane] = (
-            2.0 * b * raw - drive.velocity_filter_a[0, lane] * omega + drive.velocity_filter_z[1, lane]
-        )
-        drive.velocity_filter_z[1, lane] = b * raw - drive.velocity_filter_a[1, lane] * omega
-        drive.omega_meas[lane] = omega
+        drive.omega_meas[lane] = filtered_velocity(drive, lane, raw)
 
 
 @inlined
@@ -92,9 +83,7 @@ def measure_halls(drive, dt):
 def measure_angle(drive, dt):
     """Find the electrical angle of the commutation in use, every current tick of dt [s]: writes sin_meas, cos_meas."""
     for lane in range(LANES):
-        edges = (drive.theta_m[lane] + drive.encoder_error[lane]) * drive.counts_per_rad[lane]
-        count = encoder_count(edges, drive.encoder_true_direction[lane])
-        count = drive.count[lane] if drive.encoder_broken[lane] > 0.5 else count
+        count = count_at(drive, lane, drive.theta_m[lane] + drive.encoder_error[lane])
         turns = (count - drive.count_zero[lane]) * drive.turns_per_count[lane]
         encoder = drive.angle_zero[lane] + drive.pole_pairs[lane] * turns * TWO_PI
         open_loop = drive.angle_open_loop[lane] + dt * drive.pole_pairs[lane] * drive.velocity_demand[lane]
@@ -161,10 +150,7 @@ def measure_currents(drive):
         drive.i_alpha_meas[lane] = i_a_meas
         driven_as_dc = drive.motor_type[lane] == 1.0
         drive.i_beta_meas[lane] = 0.0 if driven_as_dc else (i_a_meas + 2.0 * i_b_meas) * (1.0 / SQRT3)
-        peak_a = abs(i_a_meas)
-        peak_b = abs(i_b_meas)
-        drive.peak_a[lane] = peak_a if peak_a > drive.peak_a[lane] else drive.peak_a[lane]
-        drive.peak_b[lane] = peak_b if peak_b > drive.peak_b[lane] else drive.peak_b[lane]
+        note_peaks(drive, lane, i_a_meas, i_b_meas)
 
 
 # Reading of the ADC registers at zero current when the channel has no offset error (default of 2060h:03 and :04).

@@ -4,24 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 
+from drive_env.firmware.common import phases
 from drive_env.firmware.common.arithmetic import TWO_PI, sine_cosine
-from drive_env.firmware.common.encoder import encoder_count, shake_encoders
-from drive_env.firmware.cycle import FirmwareStages, compose
+from drive_env.firmware.common.encoder import find_noise, forget_velocity, shake_encoders, start_counter
+from drive_env.firmware.cycle import FirmwareStages, Stage, compose
 from drive_env.firmware.record import LANES
 from drive_env.firmware.servo import alignment, causes, fields, thermal
 from drive_env.firmware.servo.derived import derive
 from drive_env.firmware.servo.index import find_whether_index_is_needed, watch_index
 from drive_env.firmware.servo.loops import current_loop, motion_loops
 from drive_env.firmware.servo.power_stage import convert_energy, open_phases, power_stage, refresh_winding
-from drive_env.firmware.servo.sensors import (
-    measure_angle,
-    measure_currents,
-    measure_halls,
-    measure_motion,
-    tell_counts,
-)
+from drive_env.firmware.servo.sensors import measure_angle, measure_currents, measure_halls, measure_motion, tell_counts
 from drive_env.firmware.servo.status_flags import tell_status
-from mechanics.compiled import inlined, stage
+from mechanics.kernels.compiled import inlined, stage
 
 
 @inlined
@@ -33,24 +28,29 @@ def collect_torque(drive, s, weight, moment):
         drive.moment_window[s, lane] += moment * drive.tau_m[lane]
 
 
-@stage
-def run_tick(drive, rates, k):
-    """Run the current loop once: sensors, regulation, bridge and winding, torque for the load's next steps.
+def tick_with(convert: Stage) -> Stage:
+    """Return the stage that runs the current loop once, with what turns a tick's currents into energy and motion."""
 
-    One stage, since a call between two of them takes some nanoseconds, 25,000 times a second.
-    """
-    if drive.block_uses_halls[0]:
-        measure_halls(drive, rates.tick)
-    measure_angle(drive, rates.tick)
-    measure_currents(drive)
-    current_loop(drive)
-    power_stage(drive)
-    if drive.block_has_open_phase[0]:
-        open_phases(drive)
-    convert_energy(drive, rates.tick, (k + 0.5) / rates.ticks + 0.5)
-    collect_torque(drive, 0, rates.weights[0, k], rates.moments[0, k])
-    for s in range(1, rates.substeps):
-        collect_torque(drive, s, rates.weights[s, k], rates.moments[s, k])
+    @stage
+    def run_tick(drive, rates, k):
+        """Run the current loop once: sensors, regulation, bridge and winding, torque for the load's next steps.
+
+        One stage, since a call between two of them takes some nanoseconds, 25,000 times a second.
+        """
+        if drive.block_uses_halls[0]:
+            measure_halls(drive, rates.tick)
+        measure_angle(drive, rates.tick)
+        measure_currents(drive)
+        current_loop(drive)
+        power_stage(drive)
+        if drive.block_has_open_phase[0]:
+            open_phases(drive)
+        convert(drive, rates.tick, (k + 0.5) / rates.ticks + 0.5)
+        collect_torque(drive, 0, rates.weights[0, k], rates.moments[0, k])
+        for s in range(1, rates.substeps):
+            collect_torque(drive, s, rates.weights[s, k], rates.moments[s, k])
+
+    return run_tick
 
 
 @stage
@@ -102,15 +102,12 @@ def find_what_is_needed(drive, rates):
     find_whether_index_is_needed(drive)
     drive.block_uses_halls[0] = 0
     drive.block_has_open_phase[0] = 0
-    drive.block_has_noisy_encoder[0] = 0
+    find_noise(drive)
     for lane in range(LANES):
         if drive.angle_source[lane] == alignment.HALL or drive.velocity_sensor[lane] == alignment.VELOCITY_BY_HALL:
             drive.block_uses_halls[0] = 1
         if drive.open_a[lane] > 0.0 or drive.open_b[lane] > 0.0 or drive.open_c[lane] > 0.0:
             drive.block_has_open_phase[0] = 1
-        # Once more after the noise has ended, so that none of it is left in the angle.
-        if drive.encoder_noise[lane] > 0.0 or drive.encoder_shake[lane] != 0.0:
-            drive.block_has_noisy_encoder[0] = 1
 
 
 @stage
@@ -122,8 +119,7 @@ def tell_sensor(drive, lane, dt):
 @stage
 def halt(drive, lane):
     """Leave no number behind that is none."""
-    drive.velocity_filter_z[0, lane] = 0.0
-    drive.velocity_filter_z[1, lane] = 0.0
+    forget_velocity(drive, lane)
     drive.current_sum_d[lane] = 0.0
     drive.current_sum_q[lane] = 0.0
     drive.i_d[lane] = 0.0
@@ -143,15 +139,7 @@ def power_on(drive, lane):
     drive.current_sum_d[lane] = 0.0
     drive.current_sum_q[lane] = 0.0
     drive.i_q_ref[lane] = 0.0
-    drive.velocity_filter_z[0, lane] = 0.0
-    drive.velocity_filter_z[1, lane] = 0.0
-    s, _ = sine_cosine(drive.theta_m[lane] + drive.encoder_line_phase[lane])
-    drive.encoder_error[lane] = drive.encoder_line_error[lane] * s
-    count = np.floor((drive.theta_m[lane] + drive.encoder_error[lane]) * drive.encoder_counts[lane] / TWO_PI)
-    gain = drive.encoder_gain[lane]
-    told = (drive.theta_m[lane] + drive.encoder_error[lane]) * drive.encoder_counts[lane] / TWO_PI * gain
-    drive.count[lane] = encoder_count(told, drive.encoder_true_direction[lane])
-    drive.count_zero[lane] = drive.count[lane]
+    count = np.floor(start_counter(drive, lane))
     drive.angle_zero[lane] = (
         drive.n_p[lane] * (count + 0.5) * TWO_PI / drive.encoder_counts[lane] + drive.commutation_offset[lane]
     )
@@ -173,11 +161,11 @@ STAGES = FirmwareStages(
     causes=causes.CAUSES,
     begin_period=(warm, prepare_quotients),
     measure=(causes.watch_phases,),
-    switch=(causes.forget_peaks, alignment.commutate, tell_sensor),
+    switch=(phases.forget_peaks, alignment.commutate, tell_sensor),
     tell=(tell_status,),
     end_period=(find_what_is_needed,),
     window=(read_motion, regulate_motion, prepare_winding),
-    tick=(run_tick,),
+    tick=(tick_with(convert_energy),),
     power_on=(power_on, tell_counts),
     halt=(halt,),
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from drive_env import cia402
 from drive_env.firmware.common import fsa, start_up
-from mechanics.compiled import stage
+from mechanics.kernels.compiled import stage
 
 # Bits of 2101h (table 85); those of the faults are the protection's.
 FLAG_HALTED, FLAG_STOP, FLAG_VELOCITY, FLAG_POSITION, FLAG_TORQUE = 1 << 4, 1 << 8, 1 << 9, 1 << 10, 1 << 11

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from drive_env.firmware.common.warming import warmed
 from drive_env.firmware.record import LANES
-from mechanics.compiled import inlined
+from mechanics.kernels.compiled import inlined
 
 LARGEST_SQUARE = 1e12  # A^2
 

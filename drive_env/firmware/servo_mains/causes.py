@@ -13,6 +13,7 @@ from typing import Any
 from drive_env.firmware.common import causes, fsa, start_up
 from drive_env.firmware.common.brake import CLOSED, PULL_IN, WITH_OUTPUT, WITH_STAGE
 from drive_env.firmware.common.modes import CSP, acts_as
+from drive_env.firmware.common.phases import open_load_a, open_load_b
 from drive_env.firmware.common.protection import (
     BLOCKS_NEGATIVE,
     BLOCKS_POSITIVE,
@@ -25,10 +26,10 @@ from drive_env.firmware.common.protection import (
     WARN,
     Cause,
 )
-from drive_env.firmware.servo.causes import open_load_a, open_load_b, overcurrent_a, overcurrent_b
+from drive_env.firmware.servo.causes import overcurrent_a, overcurrent_b
 from drive_env.firmware.servo.causes import overcurrent_high_side as overcurrent_link
 from drive_env.firmware.servo_mains.mains_link import owner
-from mechanics.compiled import inlined, stage
+from mechanics.kernels.compiled import inlined, stage
 
 REVERSE_TIME = 0.01  # s of speeding up against the current, after which the commutation is wrong
 REVERSE_SHARE = 0.5  # of the current's limit, that must be asked for

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from drive_env import cia402
 from drive_env.firmware.common import fsa
-from mechanics.compiled import stage
+from mechanics.kernels.compiled import stage
 
 MOST_MODES = 11  # modes of operation 0 to 10
 QUICK_STOP = int(cia402.COMMANDS["quick stop"].value)

@@ -10,7 +10,7 @@ from __future__ import annotations
 from drive_env.firmware.common.inputs import ENABLE, HOME, LEFT, RIGHT
 from drive_env.firmware.record import LANES
 from drive_env.firmware.servo_mains.mains_link import owner
-from mechanics.compiled import stage
+from mechanics.kernels.compiled import stage
 
 NUMBER = 8
 LEVELS_SHIFT = 16  # of 60FDh: the lower half is 0

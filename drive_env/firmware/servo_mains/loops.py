@@ -26,7 +26,7 @@ from drive_env.firmware.common.arithmetic import TWO_PI, between, sine_cosine
 from drive_env.firmware.common.modes import CSP, acts_as, is_blocked
 from drive_env.firmware.common.modes.cyclic import NO_SET_POINT
 from drive_env.firmware.record import LANES
-from mechanics.compiled import inlined, stage
+from mechanics.kernels.compiled import inlined, stage
 
 FULL_LIMITATION = 32767.0
 

@@ -21,7 +21,7 @@ import numpy as np
 from drive_env.firmware.common.arithmetic import TWO_PI, sine_cosine
 from drive_env.firmware.common.dc_link import SMALLEST_RESISTANCE, SMALLEST_VOLTAGE
 from drive_env.firmware.record import LANES, Field
-from mechanics.compiled import inlined, stage
+from mechanics.kernels.compiled import inlined, stage
 
 CHARGED = 0.9  # of the rectifier's voltage, above which the charging resistance is bridged
 SIXTH = TWO_PI / 6.0

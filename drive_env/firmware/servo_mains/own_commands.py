@@ -20,7 +20,7 @@ from drive_env.firmware.common import fsa, modes
 from drive_env.firmware.common.modes import CSP, CST, CSV, PP, PV, pp
 from drive_env.firmware.servo_mains.causes import FAULTS
 from drive_env.firmware.servo_mains.d_mode import QUICK_STOP
-from mechanics.compiled import stage
+from mechanics.kernels.compiled import stage
 
 CURRENT_MODE, VELOCITY_MODE, POSITION_MODE, SPEED_PROFILE, POSITION_PROFILE = 1, 2, 3, 6, 7  # D-Mode
 FIELDBUS_SPEED = 10  # of firmware whose csv needs it

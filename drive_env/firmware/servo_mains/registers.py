@@ -16,7 +16,7 @@ from drive_env.firmware.common import brake, inputs, start_up
 from drive_env.firmware.common.arithmetic import TWO_PI
 from drive_env.firmware.record import LANES
 from drive_env.firmware.servo import alignment
-from mechanics.compiled import inlined, stage
+from mechanics.kernels.compiled import inlined, stage
 
 DSL, ENDAT, INCREMENTAL = 1, 2, 4  # F-Type; 6 BiSS, 7 SSI
 COUNTS_PER_PULSE = 4.0

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
+from drive_env.firmware.common.dc_link import turn_rotor
+from drive_env.firmware.common.phases import forget_peaks
 from drive_env.firmware.cycle import FirmwareStages, compose
 from drive_env.firmware.record import LANES
 from drive_env.firmware.servo import alignment
 from drive_env.firmware.servo import causes as servo_causes
 from drive_env.firmware.servo.derived import derive_sensors
-from drive_env.firmware.servo.loops import current_loop
-from drive_env.firmware.servo.power_stage import open_phases, power_stage
-from drive_env.firmware.servo.sensors import measure_angle, measure_currents, measure_halls, tell_counts
+from drive_env.firmware.servo.power_stage import find_torque
+from drive_env.firmware.servo.sensors import tell_counts
 from drive_env.firmware.servo.stages import (
-    collect_torque,
     find_what_is_needed,
     halt,
     power_on,
     prepare_winding,
     read_motion,
     tell_sensor,
+    tick_with,
     warm,
 )
 from drive_env.firmware.servo_mains import causes, d_mode, fields, own_commands
@@ -33,10 +34,10 @@ from drive_env.firmware.servo_mains.mains_link import (
     derive_link,
     find_rectifier_voltage,
     forget_link,
+    move_link,
     share_rectifier,
     watch_link,
 )
-from drive_env.firmware.servo_mains.power import convert_energy
 from drive_env.firmware.servo_mains.registers import (
     energise,
     find_readings,
@@ -44,27 +45,17 @@ from drive_env.firmware.servo_mains.registers import (
     read_settings,
     tell_status,
 )
-from mechanics.compiled import stage
+from mechanics.kernels.compiled import inlined, stage
 
 
-@stage
-def run_tick(drive, rates, k):
-    """Run the current loop once: sensors, regulation, bridges and link, torque for the load's next steps.
-
-    One stage, since a call between two of them takes some nanoseconds, thousands of times a second.
-    """
-    if drive.block_uses_halls[0]:
-        measure_halls(drive, rates.tick)
-    measure_angle(drive, rates.tick)
-    measure_currents(drive)
-    current_loop(drive)
-    power_stage(drive)
-    if drive.block_has_open_phase[0]:
-        open_phases(drive)
-    convert_energy(drive, rates.tick, (k + 0.5) / rates.ticks + 0.5)
-    collect_torque(drive, 0, rates.weights[0, k], rates.moments[0, k])
-    for s in range(1, rates.substeps):
-        collect_torque(drive, s, rates.weights[s, k], rates.moments[s, k])
+@inlined
+def convert_energy(drive, dt, progress):
+    """Turn the tick's mean currents into torque and power, and move the link and the rotors on; see the servo's own."""
+    for lane in range(LANES):
+        find_torque(drive, lane)
+    move_link(drive, dt)
+    for lane in range(LANES):
+        turn_rotor(drive, lane, drive.tau_m[lane] + drive.tau_cogging[lane], dt, progress)
 
 
 @stage
@@ -119,7 +110,7 @@ STAGES = FirmwareStages(
     begin_period=(warm, prepare_link, read_module_inputs),
     measure=(find_switches, servo_causes.watch_phases, causes.watch_motion),
     switch=(
-        servo_causes.forget_peaks,
+        forget_peaks,
         d_mode.look_at_gate,
         own_commands.obey_native_control,
         own_commands.obey_service,
@@ -130,7 +121,7 @@ STAGES = FirmwareStages(
     tell=(feed_forward_current, own_commands.give_back, tell_status),
     end_period=(find_what_is_needed,),
     window=(read_motion, regulate_motion, read_mains, prepare_winding),
-    tick=(run_tick,),
+    tick=(tick_with(convert_energy),),
     power_on=(power_on, tell_counts, connect, own_commands.forget_commands, forget_readings, forget_link),
     halt=(halt, forget_link),
     remote=d_mode.is_remote,

@@ -6,23 +6,11 @@ Status flags are the driver's error flags, 2102h (TMCM-3313 manual, table 155).
 from __future__ import annotations
 
 from drive_env.firmware.common import brake, causes
-from drive_env.firmware.common.protection import (
-    BLOCKS_NEGATIVE,
-    BLOCKS_POSITIVE,
-    COMMUNICATION,
-    CUT,
-    FAULT_RESET,
-    FOLLOWING_ERROR,
-    LIMIT,
-    LIMIT_REGISTER,
-    STOP,
-    WARN,
-    Cause,
-)
+from drive_env.firmware.common.phases import open_load_a, open_load_b
+from drive_env.firmware.common.protection import CUT, FAULT_RESET, FOLLOWING_ERROR, STOP, WARN, Cause
 from drive_env.firmware.stepper.stall_guard import stalled
-from mechanics.compiled import stage
+from mechanics.kernels.compiled import stage
 
-OPEN_LOAD_TIME = 0.05  # s for which a phase must stay without the current that is asked for
 OPEN_LOAD_DEMAND = 0.3  # of the amplitude, that must be asked of a phase
 OPEN_LOAD_CURRENT = 0.05  # of the amplitude, below which there is none
 
@@ -41,13 +29,6 @@ def watch_phases(drive, lane, dt):
         drive.open_load_time_b[lane] = 0.0
     elif drive.amplitude[lane] * abs(drive.sin_ref[lane]) > asked:
         drive.open_load_time_b[lane] += dt
-
-
-@stage
-def forget_peaks(drive, lane, dt):
-    """Begin the next period's largest currents, after protection has looked at this one's."""
-    drive.peak_a[lane] = 0.0
-    drive.peak_b[lane] = 0.0
 
 
 @stage
@@ -89,18 +70,6 @@ def overcurrent_b(drive, lane, told):
 
 
 @stage
-def open_load_a(drive, lane, told):
-    """Return whether phase A has carried no current for long, although it should."""
-    return drive.open_load_time_a[lane] > OPEN_LOAD_TIME
-
-
-@stage
-def open_load_b(drive, lane, told):
-    """Return whether phase B has carried no current for long, although it should."""
-    return drive.open_load_time_b[lane] > OPEN_LOAD_TIME
-
-
-@stage
 def following_error(drive, lane, told):
     """Return whether the encoder is farther from the demand than the window of 6065h: the motor has lost steps."""
     window = drive.following_error_window[lane]
@@ -123,14 +92,7 @@ CAUSES = (
     Cause(FOLLOWING_ERROR, STOP, 0x20, 0x0, following_error),
     Cause("stall", STOP, 0x20, 0x0, stalled),
     Cause("overtemperature_warning", WARN, 0x08, 0x40, causes.warm),
-    Cause("positive_software_limit", LIMIT, LIMIT_REGISTER, 0x0, causes.above_limit, BLOCKS_POSITIVE, software=True),
-    Cause("negative_software_limit", LIMIT, LIMIT_REGISTER, 0x0, causes.below_limit, BLOCKS_NEGATIVE, software=True),
-    Cause("positive_limit_switch", LIMIT, LIMIT_REGISTER, 0x0, causes.positive_switch, BLOCKS_POSITIVE),
-    Cause("negative_limit_switch", LIMIT, LIMIT_REGISTER, 0x0, causes.negative_switch, BLOCKS_NEGATIVE),
-    # From outside the axis: its network was stopped or lost.
-    Cause(COMMUNICATION, STOP, 0x10, 0x0),
-    # The axis has left its limits: 0000h too, as CiA 301 has it, but no command, and nothing else ends with it.
-    Cause(FAULT_RESET, WARN, 0x00, 0x0),
+    *causes.LIMITS_AND_NETWORK,
 )
 
 CUTS = sum(1 << row for row, cause in enumerate(CAUSES) if row and cause.reaction == CUT)

@@ -17,7 +17,7 @@ Voltage PWM holds a share of the supply that follows the table: the current is w
 from __future__ import annotations
 
 from drive_env.firmware.record import LANES
-from mechanics.compiled import inlined
+from mechanics.kernels.compiled import inlined
 
 HYSTERESIS_UNITS = 512.0  # of the largest current (TMC5160 data sheet, HEND)
 PWM_STEPS = 255.0

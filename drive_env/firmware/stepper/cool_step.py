@@ -8,7 +8,7 @@ of it.
 from __future__ import annotations
 
 from drive_env.firmware.record import LANES
-from mechanics.compiled import inlined, stage
+from mechanics.kernels.compiled import inlined, stage
 
 THRESHOLD_UNIT = 32.0  # of the reading, for each step of 209Ah and 209Ch
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from drive_env.firmware.stepper.cool_step import reduction_span
-from mechanics.compiled import stage
+from mechanics.kernels.compiled import stage
 
 STEPS = 32.0  # of the current, 0...255 divided by eight (TMCM-3313 manual, table 33)
 RAMP_CLOCKS = 262144.0  # 2^18, for each step of the ramp down (TMC5160 data sheet, IHOLDDELAY)

@@ -21,7 +21,7 @@ from drive_env.firmware.common import modes, profiles
 from drive_env.firmware.common.arithmetic import TWO_PI
 from drive_env.firmware.record import LANES
 from drive_env.firmware.stepper.chopper import blank_clocks, larger, slow_decay_clocks
-from mechanics.compiled import inlined, stage
+from mechanics.kernels.compiled import inlined, stage
 
 HALF_PI = 1.5707963267948966
 ROOT_HALF = 0.7071067811865476  # share of the amplitude that each phase carries in a full step

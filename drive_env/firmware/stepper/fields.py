@@ -6,13 +6,14 @@ the TMCM-6212 and TMCM-3313 manuals.
 
 from __future__ import annotations
 
-from drive_env.firmware.common import dc_link, encoder, warming
+from drive_env.firmware.common import dc_link, encoder, phases, warming
 from drive_env.firmware.record import Field
 
 PARAMETERS = (
     *encoder.PARAMETERS,
     *dc_link.PARAMETERS,
     *warming.PARAMETERS,
+    *phases.PARAMETERS,
     # --- parameters that the dictionary writes --------------------------------------------------------------------
     Field("microstep_resolution", "f8", "", "2000h: 0...8; 2^this microsteps per full step", 8.0),
     Field("full_steps", "f8", "1/rev", "2001h: full steps a turn, the drive's belief", 200.0),
@@ -68,14 +69,13 @@ PARAMETERS = (
     Field("index_inverted", "f8", "", "1: N and its complement are exchanged"),
     Field("short_a", "f8", "S", "short to ground at the output of bridge A"),
     Field("short_b", "f8", "S", "the same of bridge B"),
-    Field("open_a", "f8", "", "1: the cable of phase A is broken"),
-    Field("open_b", "f8", "", "1: the cable of phase B is broken"),
 )
 
 STATE = (
     *encoder.STATE,
     *dc_link.STATE,
     *warming.STATE,
+    *phases.STATE,
     # --- steps ----------------------------------------------------------------------------------------------------
     Field("step_position", "f8", "rad", "what the steps have moved since power-on"),
     Field("step_rate", "f8", "rad/s", "speed of the steps in this window"),
@@ -124,8 +124,6 @@ STATE = (
     Field("stalled", "f8", "1", "1: a stall has stopped the steps"),
     # --- power stage and winding ----------------------------------------------------------------------------------
     Field("psi", "f8", "V*s", "flux that acts at the present current"),
-    Field("sin_e", "f8", "1", "sine of the rotor's electrical angle at the tick's start"),
-    Field("cos_e", "f8", "1", "", 1.0),
     Field("u_a", "f8", "V", "mean voltage of phase A in the tick"),
     Field("u_b", "f8", "V", ""),
     Field("emf_a", "f8", "A", "current of phase A that the back-EMF makes in the tick"),
@@ -135,10 +133,6 @@ STATE = (
     Field("i_a_mean", "f8", "A", "over the tick"),
     Field("i_b_mean", "f8", "A", ""),
     Field("tau_detent", "f8", "N*m", "mean of the last tick"),
-    Field("peak_a", "f8", "A", "largest current of phase A since protection looked last"),
-    Field("peak_b", "f8", "A", "the same of phase B"),
-    Field("open_load_time_a", "f8", "s", "time for which phase A carried no current although it should"),
-    Field("open_load_time_b", "f8", "s", "the same of phase B"),
     # The exact step of a phase, refreshed once per window.
     Field("step_i", "f8", "1", "what a tick leaves of a current"),
     Field("step_u", "f8", "A/V", "current that a held voltage makes in a tick"),
@@ -147,8 +141,6 @@ STATE = (
     Field("mean_i", "f8", "1", "mean current over the tick, from the current at its start"),
     Field("mean_u", "f8", "A/V", "the same, from the held voltage"),
     Field("mean_e", "f8", "A", "the same, from the back-EMF", depth=2),
-    Field("half_turn_sin", "f8", "1", "sine of half the electrical angle that the rotor turns in a tick"),
-    Field("half_turn_cos", "f8", "1", "", 1.0),
     Field("turn_sinc", "f8", "1", "sin x / x of that half angle", 1.0),
     Field("turn_sixth", "f8", "rad", "a sixth of that half angle"),
     # --- what is told ---------------------------------------------------------------------------------------------

@@ -9,21 +9,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from drive_env.firmware.common.arithmetic import TWO_PI, sine_cosine
-from drive_env.firmware.common.encoder import encoder_count
+from drive_env.firmware.common.arithmetic import TWO_PI
+from drive_env.firmware.common.encoder import derive_counter, filtered_velocity, index_in_window, read_counter
 from drive_env.firmware.record import LANES
-from mechanics.compiled import inlined
+from mechanics.kernels.compiled import inlined
 
 
 @inlined
 def derive_encoder(drive):
-    """Compute the quotients of the encoder: writes turns_per_count and counts_per_rad."""
+    """Compute the quotients of the encoder, and the edge of its index."""
     for lane in range(LANES):
-        # 608Fh may be 0, which is no encoder that could be counted with.
-        steps = drive.encoder_steps[lane] * drive.encoder_interpolation[lane]
-        steps = steps if steps > 0.0 else 1.0
-        drive.turns_per_count[lane] = (1.0 - 2.0 * drive.encoder_direction[lane]) / steps
-        drive.counts_per_rad[lane] = drive.encoder_counts[lane] * (1.0 / TWO_PI) * drive.encoder_gain[lane]
+        derive_counter(drive, lane)
         # N is gated with A and B: it begins at an edge.
         drive.index_edge[lane] = np.floor(drive.index_angle[lane] * drive.encoder_counts[lane] * (1.0 / TWO_PI))
 
@@ -32,23 +28,17 @@ def derive_encoder(drive):
 def watch_index(drive):
     """Look for the index in the window that has passed: writes index_seen, index_position and the latch."""
     for lane in range(LANES):
-        counts = drive.encoder_counts[lane]
-        edges = (drive.theta_m[lane] + drive.encoder_error[lane]) * counts * (1.0 / TWO_PI)
+        edges = (drive.theta_m[lane] + drive.encoder_error[lane]) * drive.encoder_counts[lane] * (1.0 / TWO_PI)
         before = drive.true_edges[lane]
         up = 1.0 if edges >= before else 0.0
         wrong = abs(drive.index_polarity[lane] - drive.index_inverted[lane])
         # Upwards N becomes active at its first edge, downwards at its second, inverted the other way round.
         first = drive.index_edge[lane] + abs(1.0 - up - wrong)
-        turn = np.floor((edges - first) / counts)
-        turn_before = np.floor((before - first) / counts)
-        sees = drive.encoder_broken[lane] < 0.5 and drive.encoder_gain[lane] > 0.0
-        came = sees and turn != turn_before
-        at = first + counts * (turn if turn > turn_before else turn_before)
+        came, at, count = index_in_window(drive, lane, edges, first, up)
         moved = edges - before
         part = (at - before) / (moved if came else 1.0)
         seen = drive.step_seen[lane]
         steps = seen + part * (drive.step_position[lane] - seen) - drive.step_shift[lane] - drive.home_shift[lane]
-        count = encoder_count(at * drive.encoder_gain[lane] + up - 0.5, drive.encoder_true_direction[lane])
         per_count = TWO_PI * drive.turns_per_count[lane]
         turned = (count - drive.count_zero[lane]) * per_count
         encoder = turned + drive.encoder_shift[lane] - drive.home_shift[lane]
@@ -72,12 +62,8 @@ def measure_motion(drive, h):
     """
     watch_index(drive)
     for lane in range(LANES):
-        s, _ = sine_cosine(drive.theta_m[lane] + drive.encoder_line_phase[lane])
-        drive.encoder_error[lane] = drive.encoder_line_error[lane] * s + drive.encoder_shake[lane]
-        edges = (drive.theta_m[lane] + drive.encoder_error[lane]) * drive.counts_per_rad[lane]
-        count = encoder_count(edges, drive.encoder_true_direction[lane])
+        count = read_counter(drive, lane)
         before = drive.count[lane]
-        count = before if drive.encoder_broken[lane] > 0.5 else count
         per_count = TWO_PI * drive.turns_per_count[lane]
         turned = (count - drive.count_zero[lane]) * per_count
         # Without current the rotor may be turned by hand: then the axis is where the encoder sees it. In a loop
@@ -96,10 +82,4 @@ def measure_motion(drive, h):
         drive.position_actual[lane] = actual
         drive.deviation[lane] = steps - actual
         raw = (count - before) * per_count / h
-        b = drive.velocity_filter_b[lane]
-        omega = b * raw + drive.velocity_filter_z[0, lane]
-        drive.velocity_filter_z[0, lane] = (
-            2.0 * b * raw - drive.velocity_filter_a[0, lane] * omega + drive.velocity_filter_z[1, lane]
-        )
-        drive.velocity_filter_z[1, lane] = b * raw - drive.velocity_filter_a[1, lane] * omega
-        drive.omega_encoder[lane] = omega
+        drive.omega_encoder[lane] = filtered_velocity(drive, lane, raw)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from drive_env.firmware.common import start_up
-from drive_env.firmware.common.arithmetic import TWO_PI, sine_cosine
+from drive_env.firmware.common import phases, start_up
 from drive_env.firmware.common.dc_link import derive_link
-from drive_env.firmware.common.encoder import encoder_count, shake_encoders
+from drive_env.firmware.common.encoder import find_noise, forget_velocity, shake_encoders, start_counter
 from drive_env.firmware.common.warming import warmed
-from drive_env.firmware.cycle import FirmwareStages, compose
+from drive_env.firmware.cycle import FirmwareStages, Stage, compose
 from drive_env.firmware.record import LANES
 from drive_env.firmware.stepper import causes, fields
 from drive_env.firmware.stepper.chopper import choose_drive, drain_shorts, find_ripple
@@ -15,16 +14,10 @@ from drive_env.firmware.stepper.cool_step import adapt_current, forget_reduction
 from drive_env.firmware.stepper.current_scale import scale_current
 from drive_env.firmware.stepper.dc_step import forget_waiting, release_steps, slow_ramp
 from drive_env.firmware.stepper.sensors import derive_encoder, measure_motion
-from drive_env.firmware.stepper.stall_guard import (
-    collect_voltage,
-    forget_load,
-    hold_stalled,
-    read_load,
-    stop_stalled,
-)
+from drive_env.firmware.stepper.stall_guard import collect_voltage, forget_load, hold_stalled, read_load, stop_stalled
 from drive_env.firmware.stepper.steps import count_steps, derive_steps, make_steps, plan_steps
 from drive_env.firmware.stepper.winding import chop, move_rotor, power_stage, refresh_winding
-from mechanics.compiled import inlined, stage
+from mechanics.kernels.compiled import inlined, stage
 
 LARGEST_SQUARE = 1e12  # A^2
 
@@ -38,20 +31,25 @@ def collect_torque(drive, s, weight, moment):
         drive.moment_window[s, lane] += moment * (drive.tau_m[lane] + drive.tau_detent[lane])
 
 
-@stage
-def run_tick(drive, rates, k):
-    """Run the current loop once: steps, chopper, winding, torque for the load's next steps.
+def tick_with(step: Stage) -> Stage:
+    """Return the stage that runs the current loop once, with what steps the field for a tick."""
 
-    One stage, since a call between two of them takes some nanoseconds, 25,000 times a second.
-    """
-    make_steps(drive, rates.tick)
-    chop(drive)
-    power_stage(drive)
-    collect_voltage(drive)
-    move_rotor(drive, rates.tick, (k + 0.5) / rates.ticks + 0.5)
-    collect_torque(drive, 0, rates.weights[0, k], rates.moments[0, k])
-    for s in range(1, rates.substeps):
-        collect_torque(drive, s, rates.weights[s, k], rates.moments[s, k])
+    @stage
+    def run_tick(drive, rates, k):
+        """Run the current loop once: steps, chopper, winding, torque for the load's next steps.
+
+        One stage, since a call between two of them takes some nanoseconds, 25,000 times a second.
+        """
+        step(drive, rates.tick)
+        chop(drive)
+        power_stage(drive)
+        collect_voltage(drive)
+        move_rotor(drive, rates.tick, (k + 0.5) / rates.ticks + 0.5)
+        collect_torque(drive, 0, rates.weights[0, k], rates.moments[0, k])
+        for s in range(1, rates.substeps):
+            collect_torque(drive, s, rates.weights[s, k], rates.moments[s, k])
+
+    return run_tick
 
 
 @stage
@@ -116,14 +114,11 @@ def spread_steps(drive, rates):
     """Plan the steps of the coming period, and leave out of it what no drive of a block needs."""
     if rates.period > 0.0:
         plan_steps(drive, rates.period)
-    drive.block_has_noisy_encoder[0] = 0
+    find_noise(drive)
     drive.block_has_dc_step[0] = 0
     for lane in range(LANES):
         if drive.dc_speed[lane] > 0.0:
             drive.block_has_dc_step[0] = 1
-        # Once more after the noise has ended, so that none of it is left in the angle.
-        if drive.encoder_noise[lane] > 0.0 or drive.encoder_shake[lane] != 0.0:
-            drive.block_has_noisy_encoder[0] = 1
 
 
 @stage
@@ -135,8 +130,7 @@ def tell_status(drive, lane):
 @stage
 def halt(drive, lane):
     """Leave no number behind that is none."""
-    drive.velocity_filter_z[0, lane] = 0.0
-    drive.velocity_filter_z[1, lane] = 0.0
+    forget_velocity(drive, lane)
     drive.step_rate[lane] = 0.0
     drive.i_a[lane] = 0.0
     drive.i_b[lane] = 0.0
@@ -159,12 +153,7 @@ def power_on(drive, lane):
     drive.i_a[lane] = 0.0
     drive.i_b[lane] = 0.0
     drive.tau_detent[lane] = 0.0
-    drive.velocity_filter_z[0, lane] = 0.0
-    drive.velocity_filter_z[1, lane] = 0.0
-    s, _ = sine_cosine(drive.theta_m[lane] + drive.encoder_line_phase[lane])
-    drive.encoder_error[lane] = drive.encoder_line_error[lane] * s
-    edges = (drive.theta_m[lane] + drive.encoder_error[lane]) * drive.encoder_counts[lane] / TWO_PI
-    drive.true_edges[lane] = edges
+    drive.true_edges[lane] = start_counter(drive, lane)
     drive.step_seen[lane] = 0.0
     drive.step_shift[lane] = 0.0
     drive.loop_closed[lane] = 0.0
@@ -173,8 +162,6 @@ def power_on(drive, lane):
     drive.latch_armed[lane] = 0.0
     drive.latch_steps[lane] = 0.0
     drive.latch_encoder[lane] = 0.0
-    drive.count[lane] = encoder_count(edges * drive.encoder_gain[lane], drive.encoder_true_direction[lane])
-    drive.count_zero[lane] = drive.count[lane]
     drive.theta_encoder[lane] = 0.0
     drive.omega_encoder[lane] = 0.0
     drive.position_actual[lane] = 0.0
@@ -188,11 +175,11 @@ STAGES = FirmwareStages(
     causes=causes.CAUSES,
     begin_period=(warm, prepare_quotients),
     measure=(causes.watch_phases,),
-    switch=(causes.forget_peaks, slow_ramp, hold_stalled, causes.switch_brake, scale_current),
+    switch=(phases.forget_peaks, slow_ramp, hold_stalled, causes.switch_brake, scale_current),
     tell=(tell_status,),
     end_period=(spread_steps,),
     window=(watch_load, read_motion, prepare_chopper),
-    tick=(run_tick,),
+    tick=(tick_with(make_steps),),
     power_on=(power_on, forget_load, forget_reduction, forget_waiting),
     halt=(halt, forget_load, forget_reduction, forget_waiting),
 )

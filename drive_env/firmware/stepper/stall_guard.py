@@ -21,7 +21,7 @@ import numpy as np
 
 from drive_env.firmware.common.arithmetic import TWO_PI
 from drive_env.firmware.record import LANES
-from mechanics.compiled import inlined, stage
+from mechanics.kernels.compiled import inlined, stage
 
 LARGEST_READING = 1023.0
 THRESHOLD_UNIT = 16.0  # 64 steps of the threshold are the whole range

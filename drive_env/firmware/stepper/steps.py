@@ -13,7 +13,7 @@ from drive_env.cia402 import CSP
 from drive_env.firmware.common.arithmetic import TWO_PI, sine_cosine
 from drive_env.firmware.record import LANES
 from drive_env.firmware.stepper.chopper import larger
-from mechanics.compiled import inlined
+from mechanics.kernels.compiled import inlined
 
 HALF_PI = 1.5707963267948966
 SMALLEST_WAY = 1e-6  # microsteps

@@ -14,10 +14,11 @@ rotor. Speed and psi are those of the window.
 from __future__ import annotations
 
 from drive_env.firmware.common.arithmetic import cosine_series, exponential, sine_cosine, sine_series
-from drive_env.firmware.common.dc_link import link_voltage
+from drive_env.firmware.common.dc_link import drain_link, turn_rotor
+from drive_env.firmware.common.phases import note_peaks
 from drive_env.firmware.record import LANES
 from drive_env.firmware.stepper.chopper import PWM_STEPS, phase_voltage
-from mechanics.compiled import inlined
+from mechanics.kernels.compiled import inlined
 
 
 @inlined
@@ -128,29 +129,9 @@ def power_stage(drive):
 def move_rotor(drive, dt, progress):
     """Take the power from the DC link and move the rotor on through one tick of dt [s]; note the largest currents.
 
-    Args:
-        drive: The record.
-        dt: Current-loop period [s].
-        progress: Middle of this tick, as a share of the window, plus one half: the load's reaction is extrapolated
-            from the middles of the last two windows to it.
+    `progress` is that of `turn_rotor`.
     """
     for lane in range(LANES):
-        u_dc = drive.u_dc[lane]
-        drained = drive.drain[lane] + drive.bridge_power[lane] / u_dc
-        drive.u_dc[lane] = link_voltage(
-            u_dc - drive.link_step[lane] * drained,
-            drive.link_decay[lane],
-            drive.link_feed[lane],
-            drive.link_share[lane],
-            drive.supply_voltage[lane],
-            drive.supply_sinks[lane],
-        )
-        size_a = abs(drive.i_a_mean[lane])
-        size_b = abs(drive.i_b_mean[lane])
-        drive.peak_a[lane] = size_a if size_a > drive.peak_a[lane] else drive.peak_a[lane]
-        drive.peak_b[lane] = size_b if size_b > drive.peak_b[lane] else drive.peak_b[lane]
-        reaction = drive.tau_reaction[lane] + progress * (drive.tau_reaction[lane] - drive.tau_reaction_before[lane])
-        omega = drive.omega_m[lane]
-        new_omega = omega + drive.tick_mobility[lane] * (drive.tau_m[lane] + drive.tau_detent[lane] - reaction)
-        drive.omega_m[lane] = new_omega
-        drive.theta_m[lane] += 0.5 * dt * (omega + new_omega)
+        drain_link(drive, lane, drive.drain[lane] + drive.bridge_power[lane] / drive.u_dc[lane])
+        note_peaks(drive, lane, drive.i_a_mean[lane], drive.i_b_mean[lane])
+        turn_rotor(drive, lane, drive.tau_m[lane] + drive.tau_detent[lane], dt, progress)

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from drive_env.firmware.common.arithmetic import clip
 from drive_env.firmware.record import LANES
-from mechanics.compiled import inlined
+from mechanics.kernels.compiled import inlined
 
 PRESCALER = 128.0  # clocks
 P_FRACTION = 256.0

@@ -13,7 +13,7 @@ from drive_env.firmware.common.arithmetic import TWO_PI, sine_cosine
 from drive_env.firmware.record import LANES
 from drive_env.firmware.stepper.current_scale import STEPS
 from drive_env.firmware.stepper_loop.load_angle import FULL_ANGLE, electrical_angle, lead_of_field
-from mechanics.compiled import inlined
+from mechanics.kernels.compiled import inlined
 
 SCALES = 256.0
 AT_ONCE = 1e9  # steps of the scale in a window

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from drive_env.firmware.common.arithmetic import TWO_PI
 from drive_env.firmware.record import LANES
-from mechanics.compiled import inlined
+from mechanics.kernels.compiled import inlined
 
 MARGIN = 1.0 + 1e-6  # of a way that the demand's speed explains
 SMALLEST_WAY = 1e-6  # microsteps

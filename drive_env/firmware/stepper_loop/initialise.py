@@ -13,7 +13,7 @@ from drive_env.firmware.common import fsa
 from drive_env.firmware.common.start_up import DONE, FIRST_ANGLE
 from drive_env.firmware.stepper.current_scale import STEPS
 from drive_env.firmware.stepper_loop.encoder import encoder_position
-from mechanics.compiled import stage
+from mechanics.kernels.compiled import stage
 
 OPEN, LOAD_ANGLE, PID_ON_RAMP, PID_ALONE = 0.0, 1.0, 2.0, 3.0
 

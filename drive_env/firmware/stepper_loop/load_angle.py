@@ -12,10 +12,10 @@ from __future__ import annotations
 import numpy as np
 
 from drive_env.firmware.common.arithmetic import TWO_PI, clip
-from drive_env.firmware.common.encoder import encoder_count
+from drive_env.firmware.common.encoder import count_at
 from drive_env.firmware.record import LANES
 from drive_env.firmware.stepper.steps import table_values
-from mechanics.compiled import inlined
+from mechanics.kernels.compiled import inlined
 
 FULL_ANGLE = 1024.0  # of an electrical turn, which is four full steps
 GREATEST = 511.0  # the register's, just below half a turn
@@ -44,8 +44,7 @@ def move_field(drive, dt):
     for lane in range(LANES):
         position = drive.step_position[lane] + drive.step_rate[lane] * dt
         theta = drive.theta_m[lane] + drive.omega_m[lane] * dt + drive.encoder_error[lane]
-        count = encoder_count(theta * drive.counts_per_rad[lane], drive.encoder_true_direction[lane])
-        count = drive.count[lane] if drive.encoder_broken[lane] > 0.5 else count
+        count = count_at(drive, lane, theta)
         rotor = (count - drive.count_zero[lane]) * TWO_PI * drive.turns_per_count[lane] + drive.loop_offset[lane]
         e = position - rotor
         lead = e if abs(e) <= drive.correction_tolerance[lane] else e * drive.angle_gain[lane]

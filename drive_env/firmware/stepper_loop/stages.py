@@ -9,28 +9,13 @@ from dataclasses import replace
 
 from drive_env.firmware.cycle import compose
 from drive_env.firmware.stepper import stages as stepper
-from drive_env.firmware.stepper.stall_guard import collect_voltage
-from drive_env.firmware.stepper.winding import chop, move_rotor, power_stage
 from drive_env.firmware.stepper_loop import fields, initialise
 from drive_env.firmware.stepper_loop.corrections import correct
 from drive_env.firmware.stepper_loop.current_level import scale_by_load, tell_torque
 from drive_env.firmware.stepper_loop.encoder import see_axis, seed_steps
 from drive_env.firmware.stepper_loop.load_angle import limit_lead, move_field
 from drive_env.firmware.stepper_loop.torque import ask_torque, tell_torque_mode
-from mechanics.compiled import stage
-
-
-@stage
-def run_tick(drive, rates, k):
-    """Run the current loop once: the field, chopper, winding, torque for the load's next steps."""
-    move_field(drive, rates.tick)
-    chop(drive)
-    power_stage(drive)
-    collect_voltage(drive)
-    move_rotor(drive, rates.tick, (k + 0.5) / rates.ticks + 0.5)
-    stepper.collect_torque(drive, 0, rates.weights[0, k], rates.moments[0, k])
-    for s in range(1, rates.substeps):
-        stepper.collect_torque(drive, s, rates.weights[s, k], rates.moments[s, k])
+from mechanics.kernels.compiled import stage
 
 
 @stage
@@ -62,7 +47,7 @@ STAGES = replace(
     tell=(*stepper.STAGES.tell, ask_torque, tell_torque_mode),
     end_period=(take_over, *stepper.STAGES.end_period),
     window=(*stepper.STAGES.window[:_READ], regulate, *stepper.STAGES.window[_READ:]),
-    tick=(run_tick,),
+    tick=(stepper.tick_with(move_field),),
     power_on=(*stepper.STAGES.power_on, initialise.power_on),
     halt=(*stepper.STAGES.halt, initialise.halt),
 )

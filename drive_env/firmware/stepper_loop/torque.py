@@ -11,7 +11,7 @@ import math
 
 from drive_env import cia402
 from drive_env.firmware.stepper.current_scale import STEPS
-from mechanics.compiled import stage
+from mechanics.kernels.compiled import stage
 
 IGNORED = ~0x1000
 

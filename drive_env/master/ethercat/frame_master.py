@@ -19,18 +19,10 @@ from drive_env.ethercat.state_machine import ACKNOWLEDGE
 from drive_env.fieldbus.errors import BusError, NoAnswerError
 from drive_env.fieldbus.link import ReceivedEmergency
 from drive_env.master.ethercat.clocks import check_clocks, set_offsets, start_sync0
-from drive_env.master.ethercat.ethercat_master import (
-    ERROR,
-    READS,
-    STATE,
-    ImageSizes,
-    SlaveIdentity,
-    SlaveStatus,
-    Sync0,
-)
+from drive_env.master.ethercat.ethercat_master import ERROR, READS, STATE, ImageSizes, SlaveIdentity, SlaveStatus, Sync0
 from drive_env.master.ethercat.frame_ways import FrameWay
 from drive_env.master.ethercat.mailbox_client import MailboxClient
-from drive_env.master.ethercat.state_names import refusal
+from drive_env.master.ethercat.state_names import refusal, take_to_op
 
 C = DatagramCommand
 FIRST_STATION, LOGICAL = 0x1001, 0x10000
@@ -314,21 +306,7 @@ class FrameMaster:
 
     def operate(self, positions: Sequence[int], exchange: Callable[[], None] | None, timeout: float) -> None:
         """Take slaves to Op; `exchange` sends images meanwhile."""
-        for position in positions:
-            self._ask_for_op(position)
-        deadline = time.monotonic() + timeout
-        while waiting := [(k, now) for k, now in ((k, self.status(k)) for k in positions) if not now.is_op]:
-            refused = [(k, now) for k, now in waiting if now.has_error and not now.is_late]
-            if refused or time.monotonic() > deadline:
-                position, status = (refused or waiting)[0]
-                raise BusError(refusal(position, AlState.OP, status))
-            for position, status in waiting:
-                if status.is_late:
-                    self._ask_for_op(position)
-            if exchange is not None:
-                exchange()
-            self.alive()
-            time.sleep(LOOK)
+        take_to_op(self, positions, self._ask_for_op, exchange, timeout)
 
     def _ask_for_op(self, position: int) -> None:
         if self.status(position).has_error:

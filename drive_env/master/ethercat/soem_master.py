@@ -21,17 +21,9 @@ from drive_env.ethercat.application import AlState
 from drive_env.fieldbus.errors import BusError, NoAnswerError, OpenError
 from drive_env.fieldbus.link import ReceivedEmergency
 from drive_env.master.ethercat.clocks import check_clocks, start_sync0
-from drive_env.master.ethercat.ethercat_master import (
-    ERROR,
-    READS,
-    STATE,
-    ImageSizes,
-    SlaveIdentity,
-    SlaveStatus,
-    Sync0,
-)
+from drive_env.master.ethercat.ethercat_master import ERROR, READS, STATE, ImageSizes, SlaveIdentity, SlaveStatus, Sync0
 from drive_env.master.ethercat.mailbox_client import MailboxClient, SdoAbortError
-from drive_env.master.ethercat.state_names import refusal
+from drive_env.master.ethercat.state_names import refusal, take_to_op
 
 MICROSECONDS = 1e6
 REGISTER_TIMEOUT = 20_000  # us
@@ -207,21 +199,7 @@ class SoemMaster:
 
     def operate(self, positions: Sequence[int], exchange: Callable[[], None] | None, timeout: float) -> None:
         """Take slaves to Op; `exchange` sends images meanwhile."""
-        deadline = time.monotonic() + timeout
-        for position in positions:
-            self._ask_for_op(position)
-        while waiting := [(k, now) for k, now in ((k, self.status(k)) for k in positions) if not now.is_op]:
-            refused = [(k, now) for k, now in waiting if now.has_error and not now.is_late]
-            if refused or time.monotonic() > deadline:
-                position, status = (refused or waiting)[0]
-                raise BusError(refusal(position, AlState.OP, status))
-            for position, status in waiting:
-                if status.is_late:
-                    self._ask_for_op(position)
-            if exchange is not None:
-                exchange()
-            self.alive()
-            time.sleep(0.001)
+        take_to_op(self, positions, self._ask_for_op, exchange, timeout)
         self._looked = -math.inf
 
     def _ask_for_op(self, position: int) -> None:

@@ -1,10 +1,15 @@
-"""Messages about refused or missing states (ETG.1000.6, table 11; ETG.1020)."""
+"""How a master takes slaves to states, and what it says of refused or missing ones (ETG.1000.6, table 11; ETG.1020)."""
 
 from __future__ import annotations
 
-from drive_env.ethercat.application import AlState, AlStatusCode
-from drive_env.master.ethercat.ethercat_master import SlaveStatus
+import time
+from collections.abc import Callable, Sequence
 
+from drive_env.ethercat.application import AlState, AlStatusCode
+from drive_env.fieldbus.errors import BusError
+from drive_env.master.ethercat.ethercat_master import EtherCatMaster, SlaveStatus
+
+LOOK = 0.001  # s between two looks at a state
 NAMES = {
     AlState.INIT: "Init", AlState.PRE_OP: "Pre-Op", AlState.BOOTSTRAP: "Bootstrap", AlState.SAFE_OP: "Safe-Op",
     AlState.OP: "Op",
@@ -33,3 +38,28 @@ def refusal(position: int, wanted: AlState, status: SlaveStatus) -> str:
     why = MEANINGS[AlStatusCode(code)] if code in {int(one) for one in MEANINGS} else "see the drive's manual"
     said = f"AL status code {code:04X}h: {why}" if code else "it gives no reason"
     return f"position {position} stays in {state_name(status.state)} and does not come to {state_name(wanted)}; {said}"
+
+
+def take_to_op(
+    master: EtherCatMaster,
+    positions: Sequence[int],
+    ask: Callable[[int], None],
+    exchange: Callable[[], None] | None,
+    timeout: float,
+) -> None:
+    """Ask slaves for Op until they are there; `exchange` sends images meanwhile. BusError if one refuses."""
+    for position in positions:
+        ask(position)
+    deadline = time.monotonic() + timeout
+    while waiting := [(k, now) for k, now in ((k, master.status(k)) for k in positions) if not now.is_op]:
+        refused = [(k, now) for k, now in waiting if now.has_error and not now.is_late]
+        if refused or time.monotonic() > deadline:
+            position, status = (refused or waiting)[0]
+            raise BusError(refusal(position, AlState.OP, status))
+        for position, status in waiting:
+            if status.is_late:
+                ask(position)
+        if exchange is not None:
+            exchange()
+        master.alive()
+        time.sleep(LOOK)

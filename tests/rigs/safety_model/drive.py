@@ -14,7 +14,7 @@ from typing import NamedTuple
 from drive_env import cia402
 from drive_env.canopen.nmt import SERVICES, Command, NmtState
 from drive_env.cia402 import State
-from drive_env.firmware.common.fsa import AUTOMATIC_TRANSITIONS, TRANSITIONS
+from drive_env.firmware.common.fsa import TRANSITIONS
 
 NOBODY = 0  # node-ID in 1016h: no node is watched
 LIVE = frozenset({State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_REACTION_ACTIVE})
@@ -22,8 +22,13 @@ LIVE = frozenset({State.OPERATION_ENABLED, State.QUICK_STOP_ACTIVE, State.FAULT_
 _COMMANDED = {
     (row.start, row.command): row for row in TRANSITIONS if row.number not in (15, 16)
 }  # 15 takes an edge, see write_controlword
-_BY_ITSELF = {row.start: row.end for row in AUTOMATIC_TRANSITIONS if row.start is not State.OPERATION_ENABLED}
-_FAULT_REACTION = next(row.end for row in AUTOMATIC_TRANSITIONS if row.number == 13)
+# Transitions that no command makes: 1, 12 and 14; 13 leads into the reaction to a fault.
+_BY_ITSELF = {
+    State.NOT_READY_TO_SWITCH_ON: State.SWITCH_ON_DISABLED,
+    State.QUICK_STOP_ACTIVE: State.SWITCH_ON_DISABLED,
+    State.FAULT_REACTION_ACTIVE: State.FAULT,
+}
+_FAULT_REACTION = State.FAULT_REACTION_ACTIVE
 _DISABLE_OPERATION = 5
 
 

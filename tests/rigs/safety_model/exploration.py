@@ -10,18 +10,7 @@ from drive_env.canopen.nmt import NmtState
 from drive_env.cia402 import State as Fsa
 from rigs.safety_model.drive import NOBODY, tick
 from rigs.safety_model.rules import Assumptions, Rules
-from rigs.safety_model.situation import (
-    DRIVE,
-    GONE,
-    LIBRARY,
-    At,
-    Hand,
-    Situation,
-    Step,
-    StopStage,
-    beating,
-    beginnings,
-)
+from rigs.safety_model.situation import DRIVE, GONE, LIBRARY, At, Hand, Situation, Step, StopStage, beating, beginnings
 from rigs.safety_model.steps import attended, left_alone, steps
 
 RUNS_ON = "runs on: nothing monitors it, and no watchdog ends it"

@@ -13,13 +13,7 @@ SHUTDOWN, SWITCH_ON, ENABLE, QUICK_STOP, DISABLE_VOLTAGE, ENABLE_AND_RESET = 0x0
 SET_POINT = -1  # among controlwords: a set-point for an axis that is live already
 
 NO_POWER = frozenset(
-    {
-        State.NOT_READY_TO_SWITCH_ON,
-        State.SWITCH_ON_DISABLED,
-        State.READY_TO_SWITCH_ON,
-        State.SWITCHED_ON,
-        State.FAULT,
-    }
+    {State.NOT_READY_TO_SWITCH_ON, State.SWITCH_ON_DISABLED, State.READY_TO_SWITCH_ON, State.SWITCHED_ON, State.FAULT}
 )
 # States that no single controlword takes to operation enabled: a frame that comes late changes nothing.
 DISABLED = NO_POWER - {State.READY_TO_SWITCH_ON, State.SWITCHED_ON}

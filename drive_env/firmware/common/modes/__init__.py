@@ -7,7 +7,7 @@ from typing import NamedTuple
 from drive_env import cia402
 from drive_env.firmware.common import fsa, profiles, protection, start_up
 from drive_env.firmware.common.modes import csp, cst, csv, cyclic, hm, idle, pp, pv, vl
-from mechanics.compiled import stage
+from mechanics.kernels.compiled import stage
 
 
 class Mode(NamedTuple):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from drive_env.firmware.common import profiles
 from drive_env.firmware.common.limits import ROUNDING, corrected_maximum, corrected_minimum
 from drive_env.firmware.common.modes import cyclic
-from mechanics.compiled import stage
+from mechanics.kernels.compiled import stage
 
 
 @stage

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from drive_env.firmware.common.modes import cyclic
-from mechanics.compiled import stage
+from mechanics.kernels.compiled import stage
 
 
 @stage

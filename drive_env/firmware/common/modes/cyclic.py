@@ -8,7 +8,7 @@ change of mode the axis holds where it is, so a target of yesterday moves nothin
 
 from __future__ import annotations
 
-from mechanics.compiled import stage
+from mechanics.kernels.compiled import stage
 
 NO_SET_POINT = -1
 

@@ -30,7 +30,7 @@ from __future__ import annotations
 from drive_env import cia402
 from drive_env.firmware.common import fsa, inputs, profiles
 from drive_env.firmware.common.arithmetic import TWO_PI
-from mechanics.compiled import stage
+from mechanics.kernels.compiled import stage
 
 LEFT, RIGHT, HOME = 0, 1, 2
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from drive_env.firmware.common import profiles
-from mechanics.compiled import stage
+from mechanics.kernels.compiled import stage
 
 
 @stage

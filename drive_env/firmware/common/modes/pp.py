@@ -5,7 +5,7 @@ from __future__ import annotations
 from drive_env import cia402
 from drive_env.firmware.common import fsa, profiles, s_ramp, shaped, six_point
 from drive_env.firmware.common.limits import ROUNDING, corrected_maximum, corrected_minimum
-from mechanics.compiled import stage
+from mechanics.kernels.compiled import stage
 
 FAR = 1e6  # rad: where a trapezoid aims that is not to brake
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from drive_env import cia402
 from drive_env.firmware.common.modes import pv
-from mechanics.compiled import stage
+from mechanics.kernels.compiled import stage
 
 AT_ONCE = 1e9  # rad/s^2
 

@@ -18,8 +18,8 @@ import numba
 from numba import config, njit, types
 from numba.core import event
 
-from mechanics.kernel_files import KernelCache
-from mechanics.stage_compiler import StageCompiler, remembered_answers
+from mechanics.kernels.kernel_files import KernelCache
+from mechanics.kernels.stage_compiler import StageCompiler, remembered_answers
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
@@ -65,6 +65,19 @@ class _QuickCompilation(event.Listener):  # type: ignore[misc]  # Numba has no t
 
 
 event.register("numba:compile", _QuickCompilation())
+
+
+def call_after_each_function(count: Callable[[], None]) -> None:
+    """Have a function called whenever Numba has compiled one."""
+
+    class Counter(event.Listener):  # type: ignore[misc]  # Numba has no types
+        def on_start(self, _event: event.Event) -> None:
+            pass
+
+        def on_end(self, _event: event.Event) -> None:
+            count()
+
+    event.register("numba:compile", Counter())
 
 
 def user_cache_folder() -> Path:

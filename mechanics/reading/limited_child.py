@@ -18,7 +18,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from mechanics.untrusted import UntrustedFileError
+from mechanics.reading.untrusted import UntrustedFileError
 
 try:
     import resource
@@ -48,7 +48,7 @@ def call_limited(
         UntrustedFileError: If a limit is exceeded, or the process ends in another way.
     """
     memory, time = MEMORY if memory is None else memory, TIME if time is None else time
-    program = f"import sys; sys.path[:] = {sys.path!r}; from mechanics.limited_child import answer; answer()"
+    program = f"import sys; sys.path[:] = {sys.path!r}; from mechanics.reading.limited_child import answer; answer()"
     asked = pickle.dumps((function.__module__, function.__name__, arguments, memory, time))
     too_long = f"{what} takes more than {time:g} s to read, and no such file is read; make it smaller"
     try:
