@@ -97,6 +97,16 @@ def test_a_data_sheet_typed_as_printed_is_the_motor_that_one_computes_by_hand(sh
         assert printed.isdigit() or f": {printed}\n" in file.read_text(), name
 
 
+def test_a_kind_that_there_is_not_is_named_before_numbers_are_asked_for(tmp_path):
+    found = new(tmp_path / "own.toml", "bldc", {})
+    assert found.exit_code == 2 and "kind is 'bldc'; it is one of 'pmsm' (brushless)" in found.output
+
+
+def test_an_absolute_encoder_has_bits():
+    assert read_number("encoder_counts", "20 bit") == ("encoder_counts", 2**20)
+    assert read_number("encoder_counts", "17-Bit") == ("encoder_counts", 131_072)
+
+
 def test_l_d_and_l_q_are_two_inductances(tmp_path):
     kind, numbers, chosen, _ = SHEETS["EMRAX 228 MV"]
     assert "0.007 ohm, 0.076 and 0.079 mH" in new(tmp_path / "own.toml", kind, numbers | chosen).output

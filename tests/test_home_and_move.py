@@ -56,6 +56,8 @@ def run(served):
     (("home", "--method", "0", "--yes"), USER_ERROR, "--method 0: node 1 has 17, 18, 19, 21, 35"),
     (("home", "--method", "17"), USER_ERROR, "Home now? There is no terminal to ask; confirm with --yes"),
     (("home", "--method", "17", "--axis", "1"), USER_ERROR, "--axis 1: a tmcm1636 has 1 axes, from 0"),
+    (("home", "--method", "35", "--node", "2", "--node", "1", "--yes"), USER_ERROR, "--node 2 --node 1: this"),
+    (("move", "1 rev", "--node", "2", "--node", "1", "--yes"), USER_ERROR, "this command is of one node"),
     (("home", "--within", "0"), USER_ERROR, "--within 0 s must be above 0 s"),
     (("move", "1 rev"), USER_ERROR, "Move now? There is no terminal to ask; confirm with --yes"),
     (("move", "1 V", "--yes"), USER_ERROR, "is not a quantity in 'V'; it takes inc, rev"),
@@ -98,7 +100,7 @@ def test_a_home_that_the_drive_does_not_show_is_not_claimed(run, monkeypatch):
 def test_a_speed_of_0_is_named_before_the_axis_is_enabled(served, run):
     served[0].write((0x6099, 2), 0)
     found = run("home", "--method", "17", "--yes")
-    assert found.exit_code == USER_ERROR and "drive-env set 6099:2 '10 rpm'" in found.stderr
+    assert found.exit_code == USER_ERROR and "drive-env set 6099:2 '10 rpm' --node 1" in found.stderr
     assert run("home", "--method", "35", "--yes").exit_code == DONE  # which needs none
 
 

@@ -12,9 +12,11 @@ from rigs.world_bus import WorldBus
 
 from drive_env import CanDrives, EmulatedDrives, Limits, cia402, motion
 from drive_env.devices import find_device
+from drive_env.drives.currents import ampere_per_count, to_counts
 from drive_env.motors import find_motor
 from tuning.auto.certify import certificate
 from tuning.auto.one_button import auto
+from tuning.identify.working_state import working_state
 from tuning.runs import sweep
 from tuning.runs.experiment import SweptObject, load_experiment
 from tuning.snapshot import load_snapshot, restore
@@ -29,6 +31,21 @@ WAY = np.full(AXES, 120.0)  # rad
 def gains(drives):
     """Return the gains that a drive has, (num_axes, count)."""
     return np.stack([drives.read(name) for name in DEVICE.gains.keys], axis=1)
+
+
+@pytest.mark.parametrize("rated", [1.52, 1.531, 1.557, 1.58])
+def test_the_current_of_identification_is_one_that_the_envelope_lets_pass(rated):
+    """The limit counts thousandths of the nominal current, 6071h 32767ths of the peak current: neither rounds up."""
+    with EmulatedDrives("tgz_d", "inertia", num_machines=AXES, num_threads=1) as inside:
+        inside.inside.connect_axes(0, AXES)
+        bus = WorldBus(ObservedWorld(inside, lockstep=True))
+        with CanDrives("tgz_d", bus=bus, pace="lockstep", timeout=5.0, safety=Limits(silence=5.0)) as drives:
+            target = Target(drives, DEVICE, MOTOR, np.full(AXES, 560.0), -WAY, WAY, MOTOR.rated_speed, rated)
+            with working_state(target) as working:
+                counts = to_counts(drives, working.current)
+                drives.write(cia402.TARGET_TORQUE, -counts)  # SafetyError if it is beyond the limit
+                assert (counts * ampere_per_count(drives) > 0.998 * rated).all()
+        bus.shutdown()
 
 
 @pytest.mark.slow

@@ -92,7 +92,7 @@ def export_dcf(context: typer.Context, file: File, *, drive: CommissionedOptions
     """
     with errors_as_exit_codes():
         _check_name(file, ".dcf")
-        _write_commissioned(context, file, drive, node_id=drive.node or 1)
+        _write_commissioned(context, file, drive, node_id=(drive.nodes or [1])[0])
 
 
 @export_app.command("esi")

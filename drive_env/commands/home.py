@@ -157,7 +157,7 @@ def _check_speeds(one: OneAxis, method: int) -> None:
     for (index, sub), example in missing_speeds(one.drives, one.drives.description, one.axis, method).items():
         raise ValueError(
             f"{index:04X}h:{sub:02X} of {one.name} is 0, so method {method} would not move the axis; set it, for "
-            f"example drive-env set {index:04X}:{sub} '{example}'"
+            f"example drive-env set {index:04X}:{sub} '{example}' --{one.name.replace(' axis', ' --axis')}"
         )
 
 

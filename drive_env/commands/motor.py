@@ -56,7 +56,7 @@ def new_motor(
     that contradict each other are refused. Friction and cogging, which data sheets do not give, are taken from motors
     of its class; correct them in the file.
     """
-    from drive_env.motors import MotorError, load_motor, motor_of
+    from drive_env.motors import MotorError, check_kind, load_motor, motor_of
     from drive_env.motors.plausibility import doubts
 
     with errors_as_exit_codes():
@@ -71,6 +71,7 @@ def new_motor(
         given = _given(numbers or [])
         if kind is None:
             kind = _asked("kind of motor, pmsm (brushless), dc (brushed) or stepper", "pmsm")
+        check_kind(kind)
         while missing := _missing(kind, given):
             if not _is_answered():
                 hint = f"; {ESTIMATES[missing[0][0]]}" if missing[0][0] in ESTIMATES else ""

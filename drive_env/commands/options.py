@@ -56,9 +56,12 @@ Nodes = Annotated[
         show_default=FIRST_NODE,
     ),
 ]  # fmt: skip
-Node = Annotated[
-    int | None, typer.Option("--node", "-n", help="Node-ID, on EtherCAT the position.", show_default=FIRST_NODE)
-]
+OneNode = Annotated[
+    list[int] | None,  # so that a second one is refused, and does not take the place of the first
+    typer.Option(
+        "--node", "-n", metavar="<int>", help="Node-ID, on EtherCAT the position.", show_default=FIRST_NODE,
+    ),
+]  # fmt: skip
 AxisOfNode = Annotated[
     int | None,
     typer.Option("--axis", help="Axis of nodes with several, from 0.", show_default="all that have the object"),
@@ -172,19 +175,24 @@ class AxesOptions(NodesOptions):
 class NodeOptions(BusOptions):
     """The same of one node."""
 
-    node: Node = None
+    node: OneNode = None
 
     @property
     def nodes(self) -> list[int] | None:
-        """The node, if it is named; None for the first."""
-        return None if self.node is None else [self.node]
+        """The node, if it is named; None for the first. ValueError for several."""
+        if len(self.node or ()) > 1:
+            raise ValueError(
+                f"--node {' --node '.join(map(str, self.node or ()))}: this command is of one node; give it once for "
+                "each, or move the axes of one machine together from Python"
+            )
+        return self.node or None
 
     @property
     def number(self) -> int:
         """The node that was asked for, or the first."""
         from drive_env.master.open_drives import default_nodes
 
-        return default_nodes(self.interface)[0] if self.node is None else self.node
+        return (self.nodes or default_nodes(self.interface))[0]
 
 
 @dataclass(frozen=True, kw_only=True)

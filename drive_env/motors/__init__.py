@@ -251,15 +251,20 @@ def load_motor(path: Path) -> Motor:
         raise MotorError(f"{path}: {error}") from None
 
 
+def check_kind(kind: object) -> None:
+    """Raise MotorError for a kind of motor that there is not."""
+    if kind not in KINDS:
+        meant = ", ".join(f"{name!r} ({what})" for name, what in KINDS.items())
+        raise MotorError(f"kind is {kind!r}; it is one of {meant}")
+
+
 def motor_of(name: str, data: Mapping[str, Any]) -> Motor:
     """Return the motor of a file's tables."""
     unknown = sorted(set(data) - {"title", "kind", "sources", "numbers", "pull_out"})
     if unknown:
         raise MotorError(f"{unknown[0]!r} is not a key of a motor; there are title, kind, sources, numbers, pull_out")
     kind = data.get("kind", "pmsm")
-    if kind not in KINDS:
-        meant = ", ".join(f"{name!r} ({what})" for name, what in KINDS.items())
-        raise MotorError(f"kind is {kind!r}; it is one of {meant}")
+    check_kind(kind)
     texts, rows = data.get("sources", {}), data.get("numbers", {})
     if not isinstance(texts, Mapping) or not isinstance(rows, Mapping):
         raise MotorError("sources and numbers are tables: [sources], [numbers]")

@@ -53,7 +53,7 @@ UNITS: dict[str, dict[str, float]] = {
 }  # fmt: skip
 COUNTED = {
     "pole_pairs": {"polepairs": 1.0, "poles": 0.5},
-    "encoder_counts": {"counts": 1.0, "lines": 4.0},
+    "encoder_counts": {"counts": 1.0, "lines": 4.0, "bit": 1.0},  # of bits the value is raised before
     "full_steps": {"steps": 1.0},
 }
 _SUFFIX = re.compile("_(ohm|h|a|v|s|rad|rpm|nm|nm_s|kg_m2|v_per_krpm|rpm_per_v)$")
@@ -87,6 +87,8 @@ def read_number(name: str, text: str) -> tuple[str, float]:
     unit = _FORM.sub("", printed)
     key = _key(name.strip().replace(" ", "_"), "".join(_FORM.findall(printed)))
     value = _decimal(name, digits) * 10.0 ** int(power)
+    if key == "encoder_counts" and unit.casefold() == "bit":
+        value = 2.0 ** min(value, 64.0)
     if not unit:
         if NUMBERS[key].unit and name != key:
             raise ValueError(f"{name} = {text!r} has no unit; {_understood(key)}; {key} is in {NUMBERS[key].unit}")

@@ -19,7 +19,7 @@ from drive_env import cia402, motion
 from drive_env.devices.gains import bandwidth_gains
 from drive_env.dictionary.entries import ObjectName
 from drive_env.dictionary.roles import Role
-from drive_env.drives.currents import read_current_limit, write_current_limit
+from drive_env.drives.currents import ampere_per_count, read_current_limit, to_counts, write_current_limit
 from drive_env.drives.interface import Drives, axis_number
 from drive_env.drives.raw_gains import write_gains
 from drive_env.drives.speeds import per_increment
@@ -172,8 +172,11 @@ def _prepare(target: Target, axes: Mask, before: Mapping[Any, Integers]) -> Work
     own = read_current_limit(drives)
     current = np.where(own > 0.0, np.minimum(own, target.current), target.current)
     write_current_limit(drives, current, axes)
-    # A limit may count more coarsely than torques do: what is asked for stays within it.
-    current = np.where(axes, np.minimum(current, read_current_limit(drives)), current)
+    # A limit may count more coarsely than torques do: what is asked for stays within it, also as whole counts of 6071h.
+    limit = read_current_limit(drives)
+    counts, ampere = to_counts(drives, limit), ampere_per_count(drives)
+    limit = np.where(counts * ampere > limit * (1.0 + 1e-9), (counts - 1) * ampere, limit)
+    current = np.where(axes, np.minimum(current, limit), current)
     scale = increments
     for ramp in (cia402.PROFILE_ACCELERATION, cia402.PROFILE_DECELERATION, cia402.QUICK_STOP_DECELERATION):
         drives.write(ramp, _raw(10.0 * target.speed * scale * per_increment(drives, ramp)), where=axes)
