@@ -74,7 +74,7 @@ PAGES = {
             ("tuning.auto.one_button", "auto"),
             ("drive_env.loops.dynamics", "Dynamics find_dynamics"),
             ("tuning.certificate.certificate", "Certificate AxisCertificate StepResponse FrequencyResponse"),
-            ("tuning.certificate.certificate_files", "load_certificate save_certificate"),
+            ("tuning.certificate.certificate_files", "load_certificate"),
             ("drive_env.drives.raw_gains", "read_gains write_gains"),
         ),
     ),
