@@ -122,6 +122,20 @@ def test_a_trip_takes_one_axis_from_operation_enabled_only(drives):
     assert (drives.read(0x6041) & 0x4F)[3] == 0x40
 
 
+def test_nothing_is_compiled_once_a_node_is_there(drives):
+    """A kernel takes seconds to compile, and each kind of array has its own; a master would wait for it."""
+    axis = Axis(drives.inside.objects, 0)
+    kernels = (FIRMWARE.write_events, FIRMWARE.trip)
+    assert [len(one.signatures) for one in kernels] == [1, 1]
+    still = np.full(10, 1)
+    still.flags.writeable = False
+    for modes in (3, still, np.full(20, 3)[::2], [1] * 10):
+        drives.write(0x6060, modes, where=np.ones(20, bool)[::2])
+    axis.port(next(e for e in ENTRIES if e.index == 0x6040)).write(6)
+    assert axis.trip() in (True, False)
+    assert [len(one.signatures) for one in kernels] == [1, 1]
+
+
 # --- as many nodes ----------------------------------------------------------------------------------------------------
 def test_ten_nodes_of_one_set(drives):
     """One set of emulated drives may be as many nodes."""

@@ -305,6 +305,7 @@ def test_prediction_with_viscous_friction_is_second_order():
     assert np.abs(omega - omega_true).max() < 2 * second + 1e-12
 
 
+@pytest.mark.slow
 def test_prediction_follows_the_elastic_shaft():
     omega, omega_true = predicted_and_true("two_mass")[:, [1, 3]].T
     error = np.abs(omega - omega_true).max() / np.abs(omega_true).max()

@@ -27,7 +27,7 @@ from mechanics.kernels import kernel_files
 from mechanics.kernels.compiled import source_hash, sources, stage, user_cache_folder
 from mechanics.kernels.kernel_files import KernelFiles
 
-ROOT = Path(kernel_files.__file__).parent.parent
+ROOT = Path(__file__).parent.parent
 # What a program does with two small kernels, and how many it compiled.
 SMALL = """
 import logging, numpy as np

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from rigs.stepped_load import stepped
 from scipy.integrate import solve_ivp
 
 from drive_env import EmulatedDrives
@@ -16,7 +17,6 @@ from mechanics.friction import FRICTION_MODELS, find_friction
 from mechanics.kernels.compiled import cached
 from mechanics.loads import LOADS
 from mechanics.packed import PackedLoad
-from mechanics.stepping import step
 
 H = 200e-6
 # The paper's parameters, for a mass of 1 kg.
@@ -53,15 +53,6 @@ def slide(row, speed, h, friction):
         friction[n], z = bristle_torque(
             speed[n], 0.0, 1e15, h, z, row[0], row[1], row[2], row[3], row[4], row[5], row[6]
         )
-
-
-@cached()
-def turn(plant, torque, h, seen):
-    """Step one copy through torques (n,); write rotor angle and speed, (n, 2)."""
-    theta, omega, reaction, position, moment = np.zeros((5, 1))
-    for n in range(torque.shape[0]):
-        step(plant, torque[n : n + 1], moment, h, theta, omega, reaction, position)
-        seen[n] = theta[0], omega[0]
 
 
 def pushed(force, h=H, row=ROW, mass=MASS):
@@ -252,9 +243,8 @@ def machine(name="inertia", friction="lugre", h=H, **parameters):
 
 
 def turned(load, torque, h=H):
-    seen = np.zeros((len(torque), 2))
-    turn(load.plant, np.ascontiguousarray(torque, float), h, seen)
-    return seen.T
+    found = stepped(load.plant, torque, h)
+    return found.theta[:, 0], found.omega[:, 0]
 
 
 def lugre_of(load):

@@ -17,6 +17,8 @@ from drive_env.firmware.stepper.stages import FIRMWARE
 from drive_env.motors import MOTORS
 from mechanics.kernels.compiled import cached
 
+pytestmark = pytest.mark.slow  # its kernel takes half a minute to compile
+
 start_window, supervise, tick = FIRMWARE.start_window, FIRMWARE.supervise, FIRMWARE.tick
 BRIDGE, COPPER, SHAFT, STAGE = range(4)
 SPEEDS = np.array([0.05, 0.5, 1.0, 1.3])  # of the rated speed
@@ -104,7 +106,6 @@ def energies(request):
         yield tuple(term.reshape(4, 4) for term in terms)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", range(4), ids=KINDS)
 def test_the_bridges_energy_is_shaft_work_losses_and_magnetic_energy_within_0_1_percent(energies, kind):
     bridge, copper, shaft, magnetic = (term[kind] for term in energies[:4])

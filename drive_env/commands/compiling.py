@@ -68,10 +68,12 @@ def _steps(devices: list[str]) -> dict[str, Callable[[], None]]:
 
 
 def _use_drives(device: str) -> None:
-    """Run emulated drives as every program does; the third call of `record` is a prepared one."""
+    """Run emulated drives as every program does, on a bus, too; the third call of `record` is a prepared one."""
     from drive_env import EmulatedDrives, motion
+    from drive_env.bus.world import World
 
     with EmulatedDrives(device=device) as drives:
+        World(lockstep=True).add(drives, [1])
         motion.enable(drives, "csv")
         for _ in range(3):
             drives.record(["Statusword"], 0.002, play={"Target velocity": [[0] * drives.num_axes] * 2})

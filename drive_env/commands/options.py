@@ -182,7 +182,7 @@ class NodeOptions(BusOptions):
         """The node, if it is named; None for the first. ValueError for several."""
         if len(self.node or ()) > 1:
             raise ValueError(
-                f"--node {' --node '.join(map(str, self.node or ()))}: this command is of one node; give it once for "
+                f"--node {' --node '.join(map(str, self.node or ()))}: this command is of one node; run it once for "
                 "each, or move the axes of one machine together from Python"
             )
         return self.node or None

@@ -232,8 +232,8 @@ def _factor(entry: Entry, name: str, scale: Scale) -> float:
     if own is None:
         raise ValueError(f"{entry.label} has no unit that {name} could be turned into; give its integer")
     if given is None or given.dimension != own.dimension:
-        fitting = [other for other, unit in UNITS.items() if unit.dimension == own.dimension]
-        raise ValueError(f"{entry.label} is not a quantity in {name!r}; it takes {', '.join([entry.unit, *fitting])}")
+        fitting = dict.fromkeys([entry.unit, *(key for key, unit in UNITS.items() if unit.dimension == own.dimension)])
+        raise ValueError(f"{entry.label} is not a quantity in {name!r}; it takes {', '.join(fitting)}")
     return own.factor / given.factor
 
 

@@ -472,7 +472,8 @@ class LiveDictionary:
                 is_whole = np.full(self.num_axes, event == cycle.WHOLE_SET_POINT, np.int32)
                 set_lanes(self._records, "target_is_whole", is_whole, where)
         elif event >= 0:
-            self.device.firmware.write_events(self._records, event, raw, where)
+            # Copies: of arrays that cannot be written, or with gaps, the kernel would be compiled once more.
+            self.device.firmware.write_events(self._records, event, np.array(raw, np.int64), np.array(where, bool))
         else:
             self._set_field(entry, raw, where)
 

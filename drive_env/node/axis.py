@@ -84,6 +84,10 @@ class Axis:
         self._error_register = self._place("error_register")[1]
         self._ports: dict[tuple[int, int], ObjectPort] = {}
         self._texts: dict[tuple[int, int], str] = {}  # that were written, until the firmware starts anew
+        # Compiled now, for no axis: a master waits for an answer, and a silent network is noticed at once.
+        firmware = self._device.firmware
+        firmware.write_events(self._records, cycle.MODE, self._word, np.zeros(LANES, bool))
+        firmware.trip(self._records, self._lane, 0, firmware.communication_lost)
 
     @property
     def state(self) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -12,7 +13,7 @@ from drive_env.devices.gains import cascade_columns, si_scales
 from drive_env.loops.dynamics import Dynamics, find_dynamics, known_dynamics
 from mechanics.arrays import Floats, Integers
 from tuning.auto.design import design_by_loops
-from tuning.auto.loop_model import model_of
+from tuning.auto.loop_model import LoopModel, model_of
 from tuning.auto.measured_margins import MeasuredAxis
 from tuning.rules.cascade import NOISE
 from tuning.rules.lags import velocity_noise
@@ -77,11 +78,12 @@ def soft_to_stiff(
     for number, dynamics in enumerate(rows := list(known_dynamics().values())):
         say(number / len(rows))
         model = model_of(device, motor, fit.plant, dynamics, measured=True)
-
-        def slack(gains: Integers, nominal: bool) -> Floats:
-            by_model = model.slack(dynamics, gains[:, None], nominal=nominal)  # noqa: B023
-            return by_model if nominal else np.minimum(by_model, loops.slack(dynamics, gains))  # noqa: B023
-
-        found.append(design_by_loops(device, fit.plant, slack, most))
+        found.append(design_by_loops(device, fit.plant, partial(_slack, model, loops, dynamics), most))
     gains, kept = zip(*found, strict=True)
     return SoftToStiff(np.array(gains), np.array(kept), tuple(cascade_columns(device)))
+
+
+def _slack(model: LoopModel, loops: MeasuredAxis, dynamics: Dynamics, gains: Integers, nominal: bool) -> Floats:
+    """Return how far rows of gains keep dynamics by the model and, unless `nominal`, by the measured loops, too."""
+    by_model = model.slack(dynamics, gains[:, None], nominal=nominal)
+    return by_model if nominal else np.minimum(by_model, loops.slack(dynamics, gains))

@@ -282,7 +282,7 @@ def measure_response(desk: TuneDesk, axis: int, loop: str) -> Callable[[Drives],
 
 
 def _soft_to_stiff(desk: TuneDesk, target: Target, measured: MeasuredLoop, axis: int) -> SoftToStiff | str:
-    """Return gains of an axis from soft to stiff by its response, or the reason why there are none."""
+    """Return gains of an axis from soft to stiff by its response, or the reason why none could be designed."""
     from tuning.auto.soft_to_stiff import soft_to_stiff
 
     if target.linked:
