@@ -61,9 +61,7 @@ def scores_of(device_name, load, parameters, sets, dynamics="standard", repeats=
     """Return the scores of sets on one machine, in their order."""
     device, motor, count = find_device(device_name), find_motor(MOTORS[device_name]), len(sets)
     score = RobustScore(device_name, load, motor, count, num_threads=1, dynamics=dynamics, repeats=repeats)
-    with EmulatedDrives(
-        device_name, load, motor, count, identical=True, num_threads=1, parameters=parameters
-    ) as drives:
+    with EmulatedDrives(device_name, load, motor, count, distinct=1, num_threads=1, parameters=parameters) as drives:
         inertia = np.concatenate([moved_inertia(group.load) for group in drives.inside.groups])
         supply = float(drives.machine.supply[0])
         score.set_machines(drives.machine.parameters, np.full(count, supply))

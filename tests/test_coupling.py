@@ -211,7 +211,7 @@ T_STEP, T_LOAD, T_END = 0.010, 0.300, 0.600
 
 def closed_loop(physics_steps, load):
     with EmulatedDrives(
-        load=load, num_machines=len(GAIN_PAIRS), identical=True, ideal=True, physics_steps=physics_steps
+        load=load, num_machines=len(GAIN_PAIRS), distinct=1, ideal=True, physics_steps=physics_steps
     ) as drives:
         drives.write((0x2042, 1), GAIN_PAIRS[:, 0])
         drives.write((0x2042, 2), GAIN_PAIRS[:, 1])

@@ -76,7 +76,7 @@ def test_a_machine_of_a_shifted_set_is_the_same_machine(sixty_four):
 
 
 def test_identical_machines_are_identical(sixty_four):
-    with machines(9, first_machine=COPY, identical=True) as drives:
+    with machines(9, first_machine=COPY, distinct=1) as drives:
         found = programme(drives)
     for lane in (0, 4, 8):
         assert_same({k: v[:, lane : lane + 1] for k, v in found.items()}, sixty_four, COPY)

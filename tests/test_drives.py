@@ -151,7 +151,7 @@ def test_one_object_may_be_recorded_by_its_name_alone(axis, one):
 
 
 def test_identical_machines_differ_in_nothing():
-    drives = EmulatedDrives(num_machines=3, randomise=True, identical=True, first_machine=7, seed=3)
+    drives = EmulatedDrives(num_machines=3, randomise=True, distinct=1, first_machine=7, seed=3)
     alone = EmulatedDrives(num_machines=1, randomise=True, first_machine=7, seed=3)
     for both in (drives, alone):
         motion.enable(both, mode="pv")

@@ -279,7 +279,7 @@ def test_open_loops_of_a_machine_are_those_of_its_plant(load, within):
 
 
 def test_machines_side_by_side_are_those_alone():
-    with EmulatedDrives(load="two_mass", num_machines=3, num_threads=1, identical=True) as drives:
+    with EmulatedDrives(load="two_mass", num_machines=3, num_threads=1, distinct=1) as drives:
         stiffness = drives.machine.parameters["load.stiffness"][0]
         drives.machine.set_all({"load.stiffness": stiffness * np.array([0.5, 1.0, 2.0])})
         three = true_machines(drives)

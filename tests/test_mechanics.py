@@ -111,7 +111,7 @@ def test_resonances_seen_through_the_drive(factor):
     anti, resonance = analytic(stiffness)
     sweep = np.concatenate([np.linspace(0.96, 1.04, 24) * anti, np.linspace(0.96, 1.04, 24) * resonance])
     parameters = {f"load.{name}": value for name, value in FRICTIONLESS.items()} | {"load.stiffness": stiffness}
-    with EmulatedDrives(num_machines=48, identical=True, ideal=True, parameters=parameters) as drives:
+    with EmulatedDrives(num_machines=48, distinct=1, ideal=True, parameters=parameters) as drives:
         motion.enable(drives, mode="cst")
         t = np.arange(1500) * 1e-3
         target = np.rint(500 * np.sin(2 * np.pi * t[:, None] * sweep)).astype(int)

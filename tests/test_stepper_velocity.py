@@ -20,7 +20,7 @@ HALT = 0x010F
 
 
 def drives_of(device, count):
-    return EmulatedDrives(device, "inertia", "qsh4218_51", num_machines=count, num_threads=1, identical=True)
+    return EmulatedDrives(device, "inertia", "qsh4218_51", num_machines=count, num_threads=1, distinct=1)
 
 
 def demand(drives, cycles):

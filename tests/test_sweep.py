@@ -123,6 +123,44 @@ def test_threads_and_batches_change_no_digit(monkeypatch):
         np.testing.assert_array_equal(other.response.speed_rpm, whole.response.speed_rpm)
 
 
+def test_a_point_is_as_good_as_the_worst_of_its_machines():
+    # The reference: the same machines in a set of their own, with the score by numpy.
+    experiment = grid(swept(P, 300, 2600, 4), machines=3, seed=5)
+    result = sweep.run(experiment)
+    for k, gain in enumerate(result.columns[P]):
+        with EmulatedDrives("tmcm1636", "two_mass", "qbl4208", num_machines=3, seed=5, randomise=True) as drives:
+            assert len(set(drives.machine.parameters["load.inertia"])) == 3
+            motion.enable(drives, mode="pv")
+            recording, fault = sweep._record(
+                drives, experiment, resolve(experiment), np.array([[gain]] * 3), lambda _share: None
+            )
+        assert not fault.any()
+        found = metrics.figures(recording)
+        score = np.where(metrics.oscillates(found), np.inf, metrics.tracking(found, TRACKING.weights))
+        assert result.score[k] == score.max()
+    assert 0 < np.isfinite(result.score).sum() < 4
+
+
+def test_the_map_tells_by_colour_why_a_point_has_no_score(small):
+    failed = dict(small.columns)
+    score = failed[small.score_column] = np.where(np.arange(9) < 5, np.inf, 1.0)
+    for flag, points in (("diverged", [0]), ("fault", [0, 1]), ("oscillates", [1, 2, 3])):
+        failed[flag] = np.isin(np.arange(9), points)
+    figure = plots.heat_map(replace(small, columns=failed, order=np.argsort(score, kind="stable")))
+    told = {text.get_text(): patch.get_facecolor() for text, patch in zip(
+        figure.axes[0].get_legend().get_texts(), figure.axes[0].get_legend().legend_handles, strict=True
+    ) if "points" in text.get_text()}  # fmt: skip
+    assert list(told) == [
+        "no tracking (1 points)", "oscillating (2 points)", "in fault (1 points)", "diverged (1 points)"
+    ]  # fmt: skip
+    cells = figure.axes[0].collections[0]
+    cells.update_scalarmappable()
+    shown = cells.to_rgba(cells.get_array()).reshape(3, 3, 4).swapaxes(0, 1).reshape(9, 4)
+    expected = ["diverged", "in fault", "oscillating", "oscillating", "no tracking"]
+    for k, name in enumerate(expected):
+        assert tuple(shown[k]) == next(colour for text, colour in told.items() if text.startswith(name))
+
+
 def test_equal_gains_at_different_places_of_the_grid_are_equal_and_other_seeds_are_not():
     # A position gain changes nothing in profile velocity mode, so that all its points are one and the same axis.
     result = sweep.run(grid(swept("2043h:01", 50, 500, 11)))
@@ -367,14 +405,14 @@ def test_pictures_show_the_grid_with_its_names_units_and_best(objects):
     if objects > 1:
         assert axes.get_ylabel() == "2042h:02 Velocity Mode Settings.I_Parameter [raw]"
         assert axes.get_yscale() == "linear"
-        cells = axes.collections[0].get_array()
+        cells = axes.collections[1].get_array()  # over those that say why a point has no score
         best = 1e3 * result.score.reshape(3, 2, -1).min(axis=2).T
         np.testing.assert_allclose(cells.filled(np.inf).reshape(best.shape), best)
     (star,) = [line for line in axes.lines if line.get_marker() == "*"]
     assert star.get_xdata()[0] == result.best(1)[0][P]
     texts = [text.get_text() for text in axes.get_legend().get_texts()]
     unusable = int(np.isinf(result.score).sum())
-    assert texts == ["best", f"oscillating, in fault or diverged ({unusable} points)"]
+    assert texts == ["best", f"oscillating ({unusable} points)"]
     responses = plots.best_response(result).axes
     assert [a.get_ylabel() for a in responses] == ["velocity [rpm]", "current i_q [A]", "load\ntorque [N·m]"]
     assert responses[2].get_xlabel() == "time [ms]"
@@ -382,7 +420,7 @@ def test_pictures_show_the_grid_with_its_names_units_and_best(objects):
 
 def test_pictures_of_a_grid_without_a_usable_pair(small):
     result = sweep.run(grid(swept(P, 4000, 5000, 2), swept(I, 100, 200, 2)))
-    assert not result.usable.any()
+    assert np.isinf(result.score).all()
     assert plots.heat_map(result).axes[0].get_legend().get_texts()[0].get_text().startswith("oscillating")
     assert "no usable point" in plots.best_response(result).get_suptitle()
     single = sweep.run(grid(swept(P, 4000, 5000, 2)))

@@ -27,7 +27,7 @@ LOOP_GAINS = ("correction_velocity_p", "correction_velocity_i")
 
 
 def drives_of(count, **options):
-    return EmulatedDrives("tmcm3313", "inertia", NAME, num_machines=count, num_threads=1, identical=True, **options)
+    return EmulatedDrives("tmcm3313", "inertia", NAME, num_machines=count, num_threads=1, distinct=1, **options)
 
 
 def turning(drives, modes, rpm):

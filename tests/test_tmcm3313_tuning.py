@@ -254,7 +254,7 @@ def test_why_trials_of_the_closed_loop_overload_the_motor(rotors, acts):
     heavy = {"load.inertia": rotors * MOTOR.inertia}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", MisfitWarning)
-        drives = EmulatedDrives("tmcm3313", "inertia", NAME, num_machines=3, identical=True, parameters=heavy)
+        drives = EmulatedDrives("tmcm3313", "inertia", NAME, num_machines=3, distinct=1, parameters=heavy)
     with drives:
         drives.write(cia402.SENSOR_SELECTION, 0)
         motion.enable(drives, mode="pp")
@@ -290,7 +290,7 @@ def test_the_ramp_of_a_trial_leaves_every_axis_behind(rotors):
 
 
 def test_trials_of_the_closed_loop_tell_its_gains_apart_and_give_the_loop_back():
-    with emulated("tmcm3313", "inertia", NAME, num_machines=3, num_threads=1, identical=True) as target:
+    with emulated("tmcm3313", "inertia", NAME, num_machines=3, num_threads=1, distinct=1) as target:
         drives = target.drives
         bench = TrialBench(target, gains=LOOP_GAINS)
         bench.identify()
@@ -382,7 +382,7 @@ def test_trials_tell_each_gain_of_the_pid_apart(prefix, without):
     """Each of them alone is another than table 3's, and J of a trial is, too; what oscillates or slips is stopped."""
     rows = [(name, value) for name, values in (*VARIED.items(), *without) for value in values]
     names = tuple(f"{prefix}_{name}" for name in VARIED)
-    with emulated("tmcm3313", "inertia", NAME, num_machines=len(rows) + 1, num_threads=1, identical=True) as target:
+    with emulated("tmcm3313", "inertia", NAME, num_machines=len(rows) + 1, num_threads=1, distinct=1) as target:
         bench = TrialBench(target, anew=True, gains=names)
         bench.identify()
         gains = bench.rule.copy()

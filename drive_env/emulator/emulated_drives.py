@@ -76,7 +76,8 @@ class EmulatedDrives(Saved):
         seed: Seed of everything random. Machine k of a seed is the same machine in every set.
         commissioned: Give the drives their motor's preset; otherwise they have their factory values.
         first_machine: Number of the first machine.
-        identical: Make every machine the one numbered `first_machine`, its noise included: for comparing gains.
+        distinct: After so many machines the same ones come again, their noise included: for comparing
+            gains. None: never.
         randomise: Parameters to draw per machine: True for all, or names or groups ("load", "motor.R_s"). How a motor
             is wired is drawn with the rest where the drives have factory values; commissioned ones know it, and it is
             drawn where it is named ("motor.encoder_direction").
@@ -110,7 +111,7 @@ class EmulatedDrives(Saved):
         *,
         commissioned: bool = True,
         first_machine: int = 0,
-        identical: bool = False,
+        distinct: int | None = None,
         randomise: bool | Collection[str] = False,
         ideal: bool = False,
         parameters: Mapping[str, ArrayLike] | None = None,
@@ -133,9 +134,9 @@ class EmulatedDrives(Saved):
         self._firmware = self.device.firmware
         self._threads = max(1, num_threads if num_threads is not None else usable_cores())
         self._executor: ThreadPoolExecutor | None = None
-        numbers = (
-            [first_machine] * num_machines if identical else list(range(first_machine, first_machine + num_machines))
-        )
+        if distinct is not None and distinct < 1:
+            raise ValueError(f"distinct must be 1 or more, not {distinct}; None for machines that are all their own")
+        numbers = [first_machine + k % (distinct or num_machines) for k in range(num_machines)]
         drawn = self._drawn(seed, numbers, randomise, ideal, parameters or {}, wired_as_known=commissioned)
         self.inside = Inside(self.device, self.motor, self.load, *drawn)
         self.inside.build_groups(physics_steps, integrator, friction)

@@ -264,7 +264,7 @@ class RobustScore(Saved):
         # Half the inertia behind a nut or a flank resonates faster than the physics' step allows the machine as it is.
         faster = self._has_loops and "contact_stiffness" in fields
         self._drives: EmulatedDrives = EmulatedDrives(
-            device, found, motor, num_machines * self._runs, identical=True, num_threads=num_threads,
+            device, found, motor, num_machines * self._runs, distinct=1, num_threads=num_threads,
             friction=friction, physics_steps=2 if faster else 1,
         )  # fmt: skip
         if repeats > 1:  # the first noise is that of a score without repeats, and the variants of a run share it

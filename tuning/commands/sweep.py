@@ -35,6 +35,10 @@ def sweep(
     motor: Annotated[str | None, typer.Option(help="Motor (name or TOML file), instead of the experiment's.")] = None,
     load: Annotated[str | None, typer.Option(help="Load, instead of the experiment's.")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed, instead of the experiment's.")] = None,
+    machines: Annotated[
+        int | None,
+        typer.Option(help="Machines that try each point; several are drawn by the seed, and the worst counts."),
+    ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder for the results, new or empty.", show_default="runs/<timestamp>-sweep")
     ] = None,
@@ -52,14 +56,14 @@ def sweep(
         bool, typer.Option("--list", help="List devices, gains, motors, loads and metrics, and stop.")
     ] = False,
 ) -> None:
-    """Try a grid of gains, each on the same emulated machine with the same velocity and load torque step.
+    """Try a grid of gains, each on the same emulated machines with the same velocity and load torque step.
 
     Prints the best and writes results.csv, heatmap.png, best_response.png and settings.toml, with which `drive-tune
     sweep --config settings.toml` repeats the run to the last digit: files of your own (motor, load, device) are copied
     to inputs/ beside it. A stopped run continues with --out and --resume, with identical results, and only with the
     files as they were.
     """
-    overrides: dict[str, Any] = {"device": device, "motor": motor, "load": load, "seed": seed}
+    overrides: dict[str, Any] = {"device": device, "motor": motor, "load": load, "seed": seed, "machines": machines}
     with errors_as_exit_codes():
         if (closed_loop or pid) and config is not None:
             raise ValueError(
@@ -133,7 +137,7 @@ def _run_with_progress(experiment: Any, console: Any, pool: Any, log: Any, folde
 
     texts = {
         "compiling": "loading the kernels (the first time: 30 seconds)",
-        "simulating": f"simulating {experiment.size()} machines",
+        "simulating": f"simulating {experiment.size() * experiment.machines} machines",
     }
 
     said: set[str] = set()
@@ -180,7 +184,9 @@ def _print_result(result: Any, folder: Path) -> None:
             ("diverged", "diverge"),
         )
     )
-    lines = [f"{usable} of {len(result.order)} points are usable; {counts}."]
+    several = result.experiment.machines
+    each = f" on each of {several} machines" if several > 1 else ""
+    lines = [f"{usable} of {len(result.order)} points are usable{each}; {counts}."]
     if not usable and result.columns["fault"].all():
         lines.append(
             "Every point ended in fault or at a limit switch, whatever its gains: for a load with little travel lower "

@@ -37,6 +37,7 @@ CLOSED_LOOPS = {  # of those that may close one, by its kind
     PID_ON_RAMP: Path(__file__).parent / "pid_sweep.toml",
 }
 MAX_POINTS = 4_194_304  # whose table takes 1 GB of memory
+MAX_PER_POINT = 64  # machines that try a point: a shard of 64 points then holds some 4,000
 MAX_DURATION = 60.0  # s
 MIN_SAMPLES = 20  # in each of the two windows; fewer say nothing about ringing
 TARGET_VELOCITY, ACCELERATION = (cia402.TARGET_VELOCITY, 0), (cia402.PROFILE_ACCELERATION, 0)
@@ -96,7 +97,13 @@ class MetricChoice:
 
 @dataclass(frozen=True)
 class Experiment:
-    """Everything a sweep is: the run repeats from this to the last digit. `versions` are those of an earlier run."""
+    """Everything a sweep is: the run repeats from this to the last digit.
+
+    Attributes:
+        machines: Machines that try each point. One is the default machine; several are drawn by the seed within their
+            parameters' ranges, and a point is as good as the worst of them.
+        versions: Those of an earlier run.
+    """
 
     device: str
     motor: str
@@ -105,6 +112,7 @@ class Experiment:
     sweep: tuple[SweptObject, ...]
     excitation: Excitation
     metric: MetricChoice
+    machines: int = 1
     versions: Mapping[str, str] = field(default_factory=dict)
 
     def points(self, first: int = 0, last: int | None = None) -> Integers:
@@ -137,7 +145,7 @@ class Experiment:
 
     def to_toml(self, versions: Mapping[str, str]) -> str:
         """Return the experiment as TOML: where a run's folder has its inputs, and the versions that ran it."""
-        lines = [f"{name} = {toml(as_kept(getattr(self, name)))}" for name in (*_NAMES, "seed")]
+        lines = [f"{name} = {toml(as_kept(getattr(self, name)))}" for name in (*_NAMES, "seed", "machines")]
         for swept in self.sweep:
             lines += ["", "[[sweep]]", *toml_lines(swept)]
         lines += ["", "[excitation]", *toml_lines(self.excitation)]
@@ -171,9 +179,9 @@ def load_experiment(
     Args:
         config: The file.
         closed_loop: Without a file take the one that ships for steppers with a loop of this kind closed.
-        overrides: device, motor, load or seed in place of the file's; None keeps the file's. The experiment that ships
-            sweeps the same gains of any device, over the same range in its units, with the device's usual motor where
-            its own does not suit that device.
+        overrides: device, motor, load, seed or machines in place of the file's; None keeps the file's. The experiment
+            that ships sweeps the same gains of any device, over the same range in its units, with the device's usual
+            motor where its own does not suit that device.
 
     Raises:
         ExperimentError: With the key, its value, the limit and the remedy.
@@ -243,6 +251,10 @@ def resolve(experiment: Experiment) -> Resolved:
         raise ExperimentError(str(error)) from None
     if not 0 <= experiment.seed < 2**63:
         raise ExperimentError(f"seed = {experiment.seed} lies outside 0...2^63 - 1; give a whole number in it")
+    if not 1 <= experiment.machines <= MAX_PER_POINT:
+        raise ExperimentError(
+            f"machines = {experiment.machines} for each point lies outside 1...{MAX_PER_POINT}; give a number in it"
+        )
     dictionary = device.new_dictionary()
     entries = tuple(_swept_entry(device, dictionary, k, swept) for k, swept in enumerate(experiment.sweep, 1))
     _check_grid(experiment, entries)
@@ -466,7 +478,7 @@ def _default_weights(name: str, sweep: tuple[SweptObject, ...]) -> Mapping[str, 
 # --- the TOML ---------------------------------------------------------------------------------------------------------
 def _parse(data: Mapping[str, Any]) -> Experiment:
     """Return the experiment of TOML data; keys and types are checked, names and limits are not."""
-    check_keys("the experiment", data, [f.name for f in fields(Experiment)], optional={"versions"})
+    check_keys("the experiment", data, [f.name for f in fields(Experiment)], optional={"machines", "versions"})
     tables = data["sweep"]
     if not isinstance(tables, list):
         raise ExperimentError(f"sweep is {kind_of(tables)}; write one table [[sweep]] per object")
@@ -491,5 +503,6 @@ def _parse(data: Mapping[str, Any]) -> Experiment:
         sweep=sweep,
         excitation=Excitation(**excitation),
         metric=MetricChoice(name, weights),
+        machines=as_value("machines", data.get("machines", 1), "int"),
         versions={key: as_value(f"versions: {key}", value, "str") for key, value in versions.items()},
     )

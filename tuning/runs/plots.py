@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, NullLocator
 
-from mechanics.arrays import Floats
+from mechanics.arrays import Floats, Integers
 from mechanics.loads import find_load
 from tuning.runs import metrics
 from tuning.runs.experiment import SweptObject
@@ -23,7 +23,13 @@ from tuning.runs.metrics import MoveRecording
 if TYPE_CHECKING:
     from tuning.runs.sweep import SweepResult
 
-UNUSABLE, NO_FIGURE = "#d0d0d0", "#f8ddc4"
+NO_FIGURE = "#f8ddc4"
+# Why a point is not usable, worst first: a column of the table, its colour, its name in the legend.
+REASONS = (
+    ("diverged", "#3a3a3a", "diverged"),
+    ("fault", "#9a9a9a", "in fault"),
+    ("oscillates", "#d8d8d8", "oscillating"),
+)
 BEST: dict[str, Any] = {
     "marker": "*",
     "markersize": 17,
@@ -104,7 +110,7 @@ def _title(result: SweepResult) -> str:
     first = "best" if np.isfinite(row[result.score_column]) else "no usable point; first"
     return (
         f"{as_kept(experiment.device)}, {as_kept(experiment.motor)}, {as_kept(experiment.load)}, "
-        f"seed {experiment.seed}: "
+        f"seed {experiment.seed}{f', the worst of {experiment.machines} machines' * (experiment.machines > 1)}: "
         f"{len(result.order)} points\n{first}: {point}\n{figures}"
     )
 
@@ -127,8 +133,9 @@ def _line(axes: Axes, result: SweepResult) -> None:
     factor, text = _scale(result)
     values, score, edges = swept.values(), factor * result.score, _edges(swept)
     valued = np.isfinite(score)
+    reasons, colours = _reasons(result), _colours()
     for k in np.flatnonzero(~valued):
-        axes.axvspan(edges[k], edges[k + 1], color=NO_FIGURE if result.usable[k] else UNUSABLE, linewidth=0, zorder=0)
+        axes.axvspan(edges[k], edges[k + 1], color=colours[reasons[k]], linewidth=0, zorder=0)
     axes.plot(values, np.where(valued, score, np.nan), color="#0072b2", marker="o", markersize=4)
     axes.set_xscale("log" if swept.spacing == "log" else "linear")
     axes.set_xlim(edges[0], edges[-1])
@@ -150,14 +157,13 @@ def _map(figure: Figure, axes: Axes, result: SweepResult) -> None:
     shape = result.experiment.shape()
     # The best over the other objects; a cell in which every one fails is unusable.
     score = factor * result.score.reshape(*shape[:2], -1).min(axis=2)
-    usable = result.usable.reshape(*shape[:2], -1).any(axis=2)
     valued = np.isfinite(score)
-    axes.set_facecolor(UNUSABLE)
     x, y = _edges(first), _edges(second)
     axes.set_xscale("log" if first.spacing == "log" else "linear")
     axes.set_yscale("log" if second.spacing == "log" else "linear")
-    if (usable & ~valued).any():
-        axes.pcolormesh(x, y, np.ma.masked_where(~usable, usable).T, cmap=ListedColormap([NO_FIGURE]))
+    colours = _colours()
+    reasons = _reasons(result).reshape(*shape[:2], -1).min(axis=2)
+    axes.pcolormesh(x, y, reasons.T, cmap=ListedColormap(colours), vmin=-0.5, vmax=len(colours) - 0.5)
     if valued.any():
         low, high = float(score[valued].min()), float(score[valued].max())
         wide = _wide(score[valued])
@@ -180,16 +186,27 @@ def _legend(axes: Axes, result: SweepResult) -> None:
     handles: list[Any] = []
     if np.isfinite(result.score).any():
         handles.append(Line2D([], [], **BEST, label="best"))
-    flagged = int((~result.usable).sum())
-    if flagged:
-        steps = ", steps lost" if result.response.is_open_loop else ""
-        text = f"oscillating, in fault{steps} or diverged ({flagged} points)"
-        handles.append(Patch(facecolor=UNUSABLE, edgecolor="0.6", label=text))
-    missing = int((result.usable & ~np.isfinite(result.score)).sum())
-    if missing:
-        text = f"no {result.experiment.metric.name} ({missing} points)"
-        handles.append(Patch(facecolor=NO_FIGURE, edgecolor="0.6", label=text))
-    axes.legend(handles=handles, loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3, frameon=False)
+    steps = " or steps lost" if result.response.is_open_loop else ""
+    names = [f"no {result.experiment.metric.name}", *(name for *_, name in reversed(REASONS))]
+    without = _reasons(result)[~np.isfinite(result.score)]
+    for number, (colour, name) in enumerate(zip(_colours(), names, strict=True)):
+        if count := int((without == number).sum()):
+            text = f"{name}{steps if name == 'in fault' else ''} ({count} points)"
+            handles.append(Patch(facecolor=colour, edgecolor="0.6", label=text))
+    axes.legend(handles=handles, loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=2, frameon=False)
+
+
+def _colours() -> list[str]:
+    """Return the colours of points without a score, by the numbers that `_reasons` gives."""
+    return [NO_FIGURE, *(colour for _, colour, _ in reversed(REASONS))]
+
+
+def _reasons(result: SweepResult) -> Integers:
+    """Return why each point has no score, shape (points,): 0 for no such figure, higher the worse it failed."""
+    reasons = np.zeros(len(result.order), np.int64)
+    for number, (flag, _, _) in enumerate(reversed(REASONS), 1):
+        reasons[result.columns[flag]] = number
+    return reasons
 
 
 def _label(axis: Any, text: str, log: bool) -> None:

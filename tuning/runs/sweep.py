@@ -1,4 +1,4 @@
-"""The sweep: every point of a grid of gains on a machine of its own, all of them the same machine, in parallel."""
+"""The sweep: every point of a grid of gains on machines of its own, for each point the same ones, in parallel."""
 
 from __future__ import annotations
 
@@ -79,11 +79,6 @@ class SweepResult:
         """The metric of the ranking, shape (points,)."""
         return np.asarray(self.columns[self.score_column])
 
-    @property
-    def usable(self) -> Mask:
-        """Which points neither oscillate nor tripped nor diverged, shape (points,)."""
-        return np.asarray(~np.any([self.columns[flag] for flag in FLAGS], axis=0))
-
     def best(self, count: int = 10) -> list[dict[str, Any]]:
         """Return the best rows of the table, best first, as column name -> value."""
         return [{name: column[k].item() for name, column in self.columns.items()} for k in self.order[:count]]
@@ -126,10 +121,10 @@ def shards(
         done: First point of each part that is done -> the point after its last.
     """
     samples = round(experiment.excitation.duration / experiment.excitation.sampling_period)
-    axes = find_load(experiment.load).num_axes
+    axes = find_load(experiment.load).num_axes * experiment.machines
     points = experiment.size()
     fair = points // (width * SHARDS_PER_WORKER) if width > 1 else MAX_MACHINES
-    fit = min(MAX_SAMPLES // (samples * axes), fair)
+    fit = min(MAX_SAMPLES // (samples * axes), fair, MAX_MACHINES // experiment.machines)
     # Whole packed models, from the same points in every cut: a constraint solver works on all copies of one at once.
     size = int(np.clip(fit, COPIES_PER_MODEL, MAX_MACHINES)) // COPIES_PER_MODEL * COPIES_PER_MODEL
     parts, first = [], 0
@@ -184,7 +179,7 @@ def run(
             if log is not None:
                 log.append(part.first, arrays)
     wall = time.perf_counter() - started
-    simulated = experiment.excitation.duration * sum(part.last - part.first for part in left)
+    simulated = experiment.excitation.duration * experiment.machines * sum(part.last - part.first for part in left)
     in_order = [found[first] for first in sorted(found)]
     names = _column_names(resolved)
     columns = {name: np.concatenate([arrays[name] for arrays in in_order]) for name in names}
@@ -223,12 +218,13 @@ def simulate(shard: Shard, report: Callable[[float], None] = lambda _share: None
     """Return the columns of a shard, and under `best.` the recording of its best point."""
     experiment = shard.experiment
     points = experiment.points(shard.first, shard.last)
-    axes = find_load(experiment.load).num_axes
     with _machines(experiment, len(points), shard.num_threads) as drives:
+        axes = drives.num_axes // len(points)
         recording, fault = _record(drives, experiment, resolve(experiment), points, report)
         columns = _evaluate(experiment, recording) | {"fault": fault}
-        columns["diverged"] = np.asarray(columns["diverged"] | np.repeat(drives.machine.diverged, axes))
-    # All axes of a machine have the point's gains; it is as good as its worst axis.
+        diverged = np.repeat(drives.machine.diverged, drives.load.num_axes)
+        columns["diverged"] = np.asarray(columns["diverged"] | diverged)
+    # All axes of all machines of a point have its gains; it is as good as its worst axis.
     worst = np.argmax(_score(columns).reshape(-1, axes), axis=1) + np.arange(len(points)) * axes
     columns = {name: values[worst] for name, values in columns.items()}
     best = recording.point(int(worst[np.argmin(_score(columns))]))
@@ -282,14 +278,15 @@ def _signals(resolved: Resolved) -> list[ObjectName]:
     return [cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL]
 
 
-def _machines(experiment: Experiment, count: int, num_threads: int | None) -> EmulatedDrives:
+def _machines(experiment: Experiment, points: int, num_threads: int | None) -> EmulatedDrives:
     return EmulatedDrives(
         experiment.device,
         load=experiment.load,
         motor=experiment.motor,
-        num_machines=count,
+        num_machines=points * experiment.machines,
         seed=experiment.seed,
-        identical=True,
+        distinct=experiment.machines,
+        randomise=experiment.machines > 1,
         num_threads=num_threads,
     )
 
