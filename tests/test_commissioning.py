@@ -271,6 +271,7 @@ def test_a_dry_run_reads_and_lists_the_steps_and_their_objects():
     (("--step", "dance"), "--step dance: the steps are motor, wiring, current, limits"),
     (("--limit", "current"), "--limit current must be NAME=VALUE, with one of current, speed"),
     (("--limit", "jerk=3"), "--limit jerk=3 must be NAME=VALUE"),
+    (("--limit", "current=3 V"), "is not a quantity in 'V'"),
     (("--dynamics", "brisk"), "give soft, standard, stiff"),
 ])  # fmt: skip
 def test_a_mistake_is_named_before_anything_is_done(words, told):

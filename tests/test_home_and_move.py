@@ -58,6 +58,8 @@ def run(served):
     (("home", "--method", "17", "--axis", "1"), USER_ERROR, "--axis 1: a tmcm1636 has 1 axes, from 0"),
     (("home", "--method", "35", "--node", "2", "--node", "1", "--yes"), USER_ERROR, "--node 2 --node 1: this"),
     (("move", "1 rev", "--node", "2", "--node", "1", "--yes"), USER_ERROR, "this command is of one node"),
+    (("move", "1 rev", "--axis", "1", "--axis", "0", "--yes"), USER_ERROR, "this command is of one axis"),
+    (("jog", "60 rpm", "--axis", "0", "--axis", "1"), USER_ERROR, "this command is of one axis"),
     (("home", "--within", "0"), USER_ERROR, "--within 0 s must be above 0 s"),
     (("move", "1 rev"), USER_ERROR, "Move now? There is no terminal to ask; confirm with --yes"),
     (("move", "1 V", "--yes"), USER_ERROR, "is not a quantity in 'V'; it takes inc, rev"),

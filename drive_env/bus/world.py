@@ -132,7 +132,7 @@ class World:
             raise ValueError(
                 f"{drives.num_axes} axes ({drives.num_machines} x load {drives.load.name!r}) take {needed} nodes of "
                 f"{drives.device.name}, which drives {per_node} axes{self._told(needed - len(here))}; "
-                f"{len(node_ids)} node identifiers were given"
+                f"{len(node_ids)} node identifiers were given: give {len(here)}, or another load or number of machines"
             )
         left_over = needed * per_node - drives.num_axes if needed - 1 in here else 0
         spare = without_motors(drives, left_over) if left_over else None

@@ -68,7 +68,7 @@ def jog(
         from drive_env.fieldbus.description import describe
 
         description = describe(bus.device, eds)
-        check_axis(description, bus.axis)
+        check_axis(description, bus.one_axis)
         limits = limits_of(description, max_current, bus.interface, no_watchdog=no_watchdog)
         if not 0.001 <= duration <= 3600.0:
             raise ValueError(f"--for {duration:g} s must be at least 0.001 s and at most an hour")
@@ -76,7 +76,7 @@ def jog(
         if dry_run:
             bus.look_first(eds)
         with bus.connect(eds, safety=limits, cycle=cycle_for(description)) as drives:
-            one = OneAxis(drives, bus.axis)
+            one = OneAxis(drives, bus.one_axis)
             movement = _asked_for(one, speed, by, duration)
             start = one.position()
             if dry_run:

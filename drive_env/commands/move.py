@@ -61,13 +61,13 @@ def move(
         from drive_env.fieldbus.description import describe
 
         description = describe(bus.device, eds)
-        check_axis(description, bus.axis)
+        check_axis(description, bus.one_axis)
         limits = limits_of(description, max_current, bus.interface, no_watchdog=no_watchdog)
         files = None if out is None else new_files(out)
         if dry_run:
             bus.look_first(eds)
         with bus.connect(eds, safety=limits, cycle=cycle_for(description)) as drives:
-            one = OneAxis(drives, bus.axis)
+            one = OneAxis(drives, bus.one_axis)
             goal, velocity = one.parse(position, cia402.TARGET_POSITION), _velocity(one, speed)
             one.check_acceleration("pp")
             start = one.read(cia402.POSITION_ACTUAL)

@@ -66,7 +66,10 @@ AxisOfNode = Annotated[
     int | None,
     typer.Option("--axis", help="Axis of nodes with several, from 0.", show_default="all that have the object"),
 ]
-AxisNumber = Annotated[int, typer.Option("--axis", help="Axis of a node with several, from 0.")]
+OneAxis = Annotated[
+    list[int] | None,  # as of OneNode
+    typer.Option("--axis", metavar="<int>", help="Axis of a node with several, from 0.", show_default="0"),
+]
 AxesInOrder = Annotated[
     list[int] | None,
     typer.Option(
@@ -199,7 +202,17 @@ class NodeOptions(BusOptions):
 class AxisOptions(NodeOptions):
     """The same of one axis of one node."""
 
-    axis: AxisNumber = 0
+    axis: OneAxis = None
+
+    @property
+    def one_axis(self) -> int:
+        """The axis, if it is named; else the first. ValueError for several."""
+        if len(self.axis or ()) > 1:
+            raise ValueError(
+                f"--axis {' --axis '.join(map(str, self.axis or ()))}: this command is of one axis; run it once for "
+                "each, or move the axes of one machine together from Python"
+            )
+        return (self.axis or [0])[0]
 
 
 @dataclass(frozen=True, kw_only=True)

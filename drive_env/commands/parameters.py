@@ -71,9 +71,9 @@ def backup(
         if str(file) != "-":
             check_free(file)
         with bus.connect(eds, safety=False) as drives:
-            _check_axis(drives, bus.axis)
-            values = read_parameters(drives, bus.axis)
-            text = sealed(parameters_text(drives, bus.axis, values))
+            _check_axis(drives, bus.one_axis)
+            values = read_parameters(drives, bus.one_axis)
+            text = sealed(parameters_text(drives, bus.one_axis, values))
         if str(file) == "-":
             print_text(text)
             return
@@ -116,10 +116,10 @@ def diff(
             scale = None
         else:
             with bus.connect(eds, safety=False) as drives:
-                _check_axis(drives, bus.axis)
-                differences = compare(drives, load_parameters(file, drives.description.dictionary), bus.axis)
+                _check_axis(drives, bus.one_axis)
+                differences = compare(drives, load_parameters(file, drives.description.dictionary), bus.one_axis)
                 _tell_of_changes(file)
-                scale = scales_of(drives)[bus.axis]
+                scale = scales_of(drives)[bus.one_axis]
         _print(differences, "drive" if other is None else other.name, file.name, scale, json)
         if differences:
             raise typer.Exit(REFUSED)
@@ -158,10 +158,10 @@ def restore(
 
         def check(drives: BusDrives) -> None:
             check_same_drive(file, written, read_identity(drives), other_drive=other_drive)
-            if axis_then not in (None, bus.axis) and not other_drive:
+            if axis_then not in (None, bus.one_axis) and not other_drive:
                 raise ValueError(
-                    f"{file} was read from axis {axis_then}, and --axis is {bus.axis}; nothing was written. To write "
-                    "it to this axis all the same, add --other-drive"
+                    f"{file} was read from axis {axis_then}, and --axis is {bus.one_axis}; nothing was written. To "
+                    "write it to this axis all the same, add --other-drive"
                 )
 
         _exchange(bus, eds, wanted, file.name, check, store=store, yes=yes, json=json, dry_run=dry_run)
@@ -225,7 +225,7 @@ def _exchange(
     from drive_env.fieldbus.description import describe
     from drive_env.master import parameters
 
-    axis, node = bus.axis, bus.number
+    axis, node = bus.one_axis, bus.number
     wanted = parameters.restorable(wanted, describe(bus.device, eds).hints)
     if dry_run:  # to open a node that is stopped would send it an NMT command
         bus.look_first(eds)

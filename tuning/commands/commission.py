@@ -88,6 +88,7 @@ def commission(
     writes certificate.json and report.html. Exit code 1 if a step failed, or you quit.
     """
     with errors_as_exit_codes():
+        from tuning.commissioning.axis_limits import raw_limits
         from tuning.commissioning.bench import CommissioningPlan
         from tuning.commissioning.homing import check_method
         from tuning.commissioning.path import BEFORE, CommissioningPath
@@ -102,12 +103,14 @@ def commission(
         if dry_run:
             with drive.open_to_read() as target:
                 check_method(target, method)
+                raw_limits(target, plan.limits)
                 _tell_plan(target, chosen, json)
             return
         file = folder / BEFORE if drive.bus else None
         drive.check()
         with way_back(file, "drive-tune"), open_target(drive) as target:
             check_method(target, method)
+            raw_limits(target, plan.limits)  # before anything moves: a wrong text is told at once
             with CommissioningPath(target, plan, folder) as path:
                 _walk(path, chosen, yes=drive.yes, quiet=json)
         if json:

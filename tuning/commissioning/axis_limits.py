@@ -15,6 +15,7 @@ from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import read_current_limit
 
 if TYPE_CHECKING:
+    from mechanics.arrays import Integers
     from tuning.target import Target
 
 PEAK = 3.0  # of the motor's rated current: a limit above is not this motor's
@@ -49,6 +50,19 @@ def limits_of(target: Target) -> dict[str, list[Entry]]:
     return found
 
 
+def raw_limits(target: Target, wanted: Mapping[str, str]) -> list[tuple[str, Entry, Integers]]:
+    """Return limits that are given as texts: name, object and the integers of all axes of each.
+
+    Raises:
+        ValueError: For a limit that the drive does not have, or a text of another quantity.
+    """
+    there = limits_of(target)
+    if unknown := next((name for name in wanted if name not in there), None):
+        raise ValueError(f"there is no limit {unknown!r}: a {target.device.name} has {', '.join(there)}")
+    scales = quantities.scales_of(target.drives, target.device.new_dictionary())
+    return [(name, one, quantities.integers(text, one, scales)) for name, text in wanted.items() for one in there[name]]
+
+
 def write_limits(target: Target, wanted: Mapping[str, str], *, places: bool) -> list[str]:
     """Write limits that are given as texts, and return the values of each object, before and now, in words.
 
@@ -61,18 +75,12 @@ def write_limits(target: Target, wanted: Mapping[str, str], *, places: bool) -> 
         ValueError: For a limit that the drive does not have, or a text that does not fit it, before anything is
             written.
     """
-    drives, there = target.drives, limits_of(target)
-    if unknown := next((name for name in wanted if name not in there), None):
-        raise ValueError(f"there is no limit {unknown!r}: a {target.device.name} has {', '.join(there)}")
+    drives = target.drives
     scales = quantities.scales_of(drives, target.device.new_dictionary())
-    rows = []
-    for entry, text in (
-        (one, wanted[name]) for name in wanted for one in there[name] if LIMITS[name].is_place == places
-    ):
-        raw = quantities.integers(text, entry, scales)
+    rows = [(entry, raw) for name, entry, raw in raw_limits(target, wanted) if LIMITS[name].is_place == places]
+    for entry, raw in rows:
         for one in raw.tolist():
             check_limits(entry, one)
-        rows.append((entry, raw))
     told = []
     for entry, raw in rows:
         before = drives.read((entry.index, entry.sub))
