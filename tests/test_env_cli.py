@@ -24,6 +24,7 @@ from drive_env.bus.server import Server
 from drive_env.bus.world import World
 from drive_env.commands import scan
 from drive_env.commands.cli import GROUPS, PANELS, app
+from drive_env.commands.monitor import spark_line
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.drives.limits import Limits
 from drive_env.fieldbus.errors import BusError, NoAnswerError
@@ -434,6 +435,15 @@ def test_jog_holds_its_current_and_a_drive_that_cannot_follow_ends_it(run, share
     assert shared[1][0].read(0x6041)[0] & 0x6F != 0x27
     assert shared[1][0].read(0x2003)[0] == 7000  # its own again
     run("set", "6040", "0x80")
+
+
+def test_monitor_draws_the_last_readings_between_their_least_and_their_greatest(run):
+    code, out, _ = run("monitor", "6041", "6064", "--plot", "--duration", 0.2, "--period", 0.02)
+    line = next(one for one in reversed(out.splitlines()) if one.startswith("6064h ▁"))
+    assert code == 0 and " inc (0 rev)" in line and not any(one.startswith("6041h ▁") for one in out.splitlines())
+    assert spark_line([0, 10, 35, 70, -70, 70]) == "▄▅▆█▁█"  # by hand: seven steps of 20
+    assert spark_line([7, 7]) == "▁▁"
+    assert "leave one of them out" in run("monitor", "--plot", "--json")[2]
 
 
 def test_monitor_shows_values_and_state(run):

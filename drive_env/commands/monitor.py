@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -26,9 +27,14 @@ from drive_env.commands.tables import Column, tables
 from drive_env.dictionary.roles import Role
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from drive_env.dictionary.entries import Entry
     from drive_env.dictionary.quantities import Scale
     from drive_env.master.bus_drives import BusDrives
 
+SPARKS = "▁▂▃▄▅▆▇█"
+MOST_SPARKS = 60  # readings that a line of --plot shows
 DEFAULT = ("6041", "6061", "6064", "606C", "6077")
 
 
@@ -44,6 +50,7 @@ def monitor(
     duration: Annotated[
         float | None, typer.Option(help="Stop after this time [s]; otherwise stop with Ctrl-C.")
     ] = None,
+    plot: Annotated[bool, typer.Option("--plot", help="Draw the last 60 readings of each below the table.")] = False,
     json: Json = False,
 ) -> None:
     """Show objects in a table that refreshes, with emergencies as they come; it only reads, over SDO.
@@ -54,6 +61,8 @@ def monitor(
     with errors_as_exit_codes():
         check_time("--period", period)
         check_time("--duration", duration)
+        if plot and json:
+            raise ValueError("--plot draws on the screen, and --json writes lines for programs; leave one of them out")
         with bus.connect(eds, safety=False) as drives:
             known = drives.description.dictionary
             entries = [known.find(object_name(name)) for name in objects or default_objects(known, DEFAULT)]
@@ -64,7 +73,7 @@ def monitor(
                 if json:
                     _lines(drives, axes, entries, watch, period, end)
                 else:
-                    _table(drives, axes, entries, watch, period, end)
+                    _table(drives, axes, entries, watch, period, end, plot)
             except KeyboardInterrupt:
                 pass  # the usual end
 
@@ -122,13 +131,19 @@ def _lines(drives: BusDrives, axes: list[int], entries: list[Any], watch: _Pushi
         time.sleep(period)
 
 
-def _table(drives: BusDrives, axes: list[int], entries: list[Any], watch: _Pushing, period: float, end: float) -> None:
+def _table(
+    drives: BusDrives, axes: list[int], entries: list[Any], watch: _Pushing, period: float, end: float, plot: bool
+) -> None:
     from rich.live import Live
 
     from drive_env.drives.limit_at_rest import SAYS
 
     scales = scales_of(drives)
     emergencies: list[str] = []
+    plotted = [entry for entry in entries if plot and _is_number(entry)]
+    traces: dict[Any, deque[int]] = {
+        (entry, k): deque(maxlen=MOST_SPARKS) for entry in plotted for k in range(len(axes))
+    }
     with Live(auto_refresh=False) as live:
         while True:
             for message in _heard(drives, axes):
@@ -137,13 +152,34 @@ def _table(drives: BusDrives, axes: list[int], entries: list[Any], watch: _Pushi
             pushing = [
                 f"{axis_name(drives, axis)}: {SAYS}" for axis, pushes in zip(axes, watch.look(), strict=True) if pushes
             ]
-            told = emergencies[-5:] + pushing
-            live.update(
-                _draw(drives, axes, _look(drives, axes, entries), scales, told, live.console.width), refresh=True
-            )
+            values = _look(drives, axes, entries)
+            for (entry, k), trace in traces.items():
+                trace.append(int(values[entry][k]))
+            told = [_trace_line(drives, entry, axes[k], trace, scales) for (entry, k), trace in traces.items()]
+            told += emergencies[-5:] + pushing
+            live.update(_draw(drives, axes, values, scales, told, live.console.width), refresh=True)
             if time.monotonic() + period > end:
                 return
             time.sleep(period)
+
+
+def _is_number(entry: Entry) -> bool:
+    """Return whether an object has values to draw: a number that is no statusword."""
+    return entry.bits is not None and cia402.of_first_axis(entry.index) != cia402.STATUSWORD
+
+
+def spark_line(values: Sequence[int]) -> str:
+    """Return numbers as a line of bars, from the least, the lowest bar, to the greatest; flat where all are equal."""
+    low, span = min(values), max(values) - min(values)
+    return "".join(SPARKS[(value - low) * (len(SPARKS) - 1) // span if span else 0] for value in values)
+
+
+def _trace_line(drives: BusDrives, entry: Entry, axis: int, trace: Sequence[int], scales: list[Scale]) -> str:
+    from drive_env.dictionary.quantities import show
+
+    ends = " to ".join(show(value, entry, scales[axis]) for value in (min(trace), max(trace)))
+    name = f"{entry.index:04X}h" + (f" {axis_name(drives, axis)}" if drives.num_axes > 1 else "")
+    return f"{name} {spark_line(trace)} {ends}"
 
 
 def _draw(
