@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from drive_env.master.bus_drives import BusDrives
 
 SPARKS = "▁▂▃▄▅▆▇█"
-MOST_SPARKS = 60  # readings that a line of --plot shows
+MOST_SPARKS = 32  # readings that a line of --plot shows
 DEFAULT = ("6041", "6061", "6064", "606C", "6077")
 
 
@@ -50,7 +50,7 @@ def monitor(
     duration: Annotated[
         float | None, typer.Option(help="Stop after this time [s]; otherwise stop with Ctrl-C.")
     ] = None,
-    plot: Annotated[bool, typer.Option("--plot", help="Draw the last 60 readings of each below the table.")] = False,
+    plot: Annotated[bool, typer.Option("--plot", help="Draw the last 32 readings of each below the table.")] = False,
     json: Json = False,
 ) -> None:
     """Show objects in a table that refreshes, with emergencies as they come; it only reads, over SDO.
