@@ -65,6 +65,23 @@ def test_nothing_is_wider_than_the_window(tab, path, width):
 
 
 @pytest.mark.slow
+def test_a_notice_on_a_phone_has_its_own_room_and_covers_nothing(tab):
+    at_rest(tab)
+    size_of(tab.driver, 360, 800)
+    tab.open("/axes")
+    tab.press("home")
+    until(lambda: tab.told(), "a notice")
+    time.sleep(1.0)  # it has come to its place
+    tab.driver.execute_script("window.scrollTo(0, document.body.scrollHeight)")
+    time.sleep(0.5)
+    edges = """const box = (css) => [...document.querySelectorAll(css)].map((one) => one.getBoundingClientRect());
+        return [Math.max(...box(".studio-card").map((one) => one.bottom)), box(".studio-footer")[0].top,
+            box(".q-notification")[0].top, box(".q-notification").at(-1).bottom, box(".studio-stop")[0].top]"""
+    card, footer, notice, end, stop = tab.driver.execute_script(edges)
+    assert card <= footer <= notice < end <= stop
+
+
+@pytest.mark.slow
 def test_navigation_by_keyboard_alone(tab):
     tab.open("/axes")
     for _ in range(12):

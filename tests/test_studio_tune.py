@@ -347,11 +347,33 @@ def test_auto_comes_to_its_certificate_and_is_undone(desk, tmp_path):
     assert verdict.before == before
     assert gains_of(desk) == verdict.after != before
     assert [step.gains for step in desk.last_steps(0, "position")] == [verdict.after, before]
-    assert ("velocity", 0) in desk.responses
+    designed = StiffnessSlider(panel_of(desk), None).designed  # without a press of Measure
+    assert (np.diff([designed.at(place, before)[VELOCITY_P] for place in (0.0, 0.5, 1.0)]) > 0).all()
     assert {one.name for one in run.folder.iterdir()} == {"before.toml", "certificate.json", "report.html"}
     assert run.share == 1.0
+    do(desk, tune_jobs.measure_response(desk, 0, "velocity"), paced=False)
+    anew = StiffnessSlider(panel_of(desk), None).designed
+    assert anew.gains[:, VELOCITY_P] == pytest.approx(designed.gains[:, VELOCITY_P], rel=0.1)
     do(desk, tune_jobs.undo(desk, 0))
     assert gains_of(desk) == before
+
+
+@pytest.mark.slow
+def test_a_stop_while_the_slider_is_designed_leaves_the_outcome_of_auto(desk, tmp_path, monkeypatch):
+    measured = do(desk, tune_jobs.measure_response(desk, 0, "velocity"), paced=False)
+    monkeypatch.setattr(tune_jobs, "_keep_measured", lambda *_: [0])
+    monkeypatch.setattr(tune_jobs, "verdicts", lambda _: ("accepted",))
+    desk.soft_to_stiff.clear()
+    run = TunerSession("auto", tmp_path)
+    future = desk.session.do(tune_jobs.run_tuner(desk, run, lambda *_: None), "auto", page="page", paced=False)
+    wait(desk, lambda: 0 in desk.soft_to_stiff)
+    assert run.is_over and run.verdicts
+    desk.session.stop_now("a page")
+    wait(desk, future.done, 10.0)
+    with pytest.raises(JobEndedError):
+        future.result(0)
+    assert run.verdicts and not run.failure and not desk.soft_to_stiff
+    assert desk.responses["velocity", 0] is measured
 
 
 @pytest.mark.slow

@@ -272,13 +272,24 @@ def measure_response(desk: TuneDesk, axis: int, loop: str) -> Callable[[Drives],
         desk.responses[loop, axis] = found
         desk.gains = read_gains(drives)
         if loop == "velocity":
-            desk.soft_to_stiff[axis] = "Gains from soft to stiff are being designed by this response."
-            desk.touch()
-            desk.soft_to_stiff[axis] = _soft_to_stiff(desk, target, found, axis)
+            _fill_slider(desk, target, axis)
         desk.touch()
         return found
 
     return job
+
+
+def _fill_slider(desk: TuneDesk, target: Target, axis: int) -> None:
+    """Design the gains of the slider by the response of an axis's velocity loop; a stop leaves it without."""
+    desk.soft_to_stiff[axis] = "Gains from soft to stiff are being designed by this response."
+    desk.touch()
+    try:
+        desk.soft_to_stiff[axis] = _soft_to_stiff(desk, target, desk.responses["velocity", axis], axis)
+    except BaseException:
+        del desk.soft_to_stiff[axis]
+        raise
+    finally:
+        desk.touch()
 
 
 def _soft_to_stiff(desk: TuneDesk, target: Target, measured: MeasuredLoop, axis: int) -> SoftToStiff | str:
@@ -361,7 +372,7 @@ def run_tuner(
             try:
                 with desk.target(drives) as target:
                     result = work(target, run, _progress(desk, run))
-                    _keep_measured(desk, target, result, run.title)
+                    measured = _keep_measured(desk, target, result, run.title)
                 run.verdicts = verdicts(result)
             finally:
                 desk.gains = read_gains(drives)
@@ -378,6 +389,9 @@ def run_tuner(
         finally:
             run.is_over = True
             desk.touch()
+        # The verdict stands by now: a stop from here on leaves the slider empty, and the run as it is.
+        for axis in measured:
+            _fill_slider(desk, target, axis)
 
     return job
 
@@ -393,14 +407,14 @@ def _progress(desk: TuneDesk, run: TunerSession) -> Callable[[str, float], None]
     return tell
 
 
-def _keep_measured(desk: TuneDesk, target: Target, result: Any, title: str) -> None:
-    """Keep what auto measured on the drives: its moves, that with the present gains last, and the response."""
+def _keep_measured(desk: TuneDesk, target: Target, result: Any, title: str) -> list[int]:
+    """Keep what auto measured: its moves, that with the present gains last, and the response of the axes returned."""
     from tuning.auto.certify import recorded_moves
     from tuning.auto.result import Result
 
     if not isinstance(result, Result):
-        return  # that of a stepper's commissioning has none
-    increments = target.increments()
+        return []  # that of a stepper's commissioning has none
+    increments, kept = target.increments(), []
     for k, axis in enumerate(result.axes):
         # The gains of the new move where the axis was rejected are those that did not stay.
         moves = [(one, (axis.after if axis.accepted else ()) if one.tuned else axis.before)
@@ -415,6 +429,8 @@ def _keep_measured(desk: TuneDesk, target: Target, result: Any, title: str) -> N
         if result.response is not None and np.isfinite(result.response.open_loop[:, k]).any():
             desk.responses["velocity", k] = result.response
             desk.soft_to_stiff.pop(k, None)
+            kept.append(k)
+    return kept
 
 
 def verdicts(result: Any) -> tuple[AxisVerdict, ...]:

@@ -36,6 +36,7 @@
 
   studio.start = (page) => {
     studio.page = page;
+    document.querySelector(".studio-footer")?.prepend(document.getElementById("q-notify") || "");
     connect();
   };
 
