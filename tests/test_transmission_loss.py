@@ -62,7 +62,7 @@ def test_a_loss_is_found_by_how_braking_differs_from_driving(loss, gravity):
 
 
 def test_an_axis_without_a_loss_has_none():
-    assert find_losses(*moved(0.0), MOTOR, np.array([DRY, VISCOUS])) == ()
+    assert not find_losses(*moved(0.0), MOTOR, np.array([DRY, VISCOUS]))[0].is_clear
 
 
 def test_the_load_alone_is_what_a_loss_leaves_of_the_inertia_seen():

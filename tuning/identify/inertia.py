@@ -466,10 +466,12 @@ def _with_losses(
         one.load_alone(float(found.mean[0] * K) * hidden, motor.inertia)
         for one, found in zip(losses, fits, strict=True)
     ]
+    unseen = np.zeros(4)
+    unseen[0] = np.abs(np.array(inertias) - inertias[0]).max() / K
+    if not losses[0].is_clear:
+        return inertias[0], fit, unseen
     ways = friction_of_whole_ways(did, cruises, losses[0], float(fits[0].mean[0]))
-    unseen = np.concatenate(
-        [[np.abs(np.array(inertias) - inertias[0]).max() / K], np.abs(ways.mean - fits[0].mean[1:])]
-    )
+    unseen[1:] = np.abs(ways.mean - fits[0].mean[1:])
     mean = np.concatenate([fits[0].mean[:1], 0.5 * (ways.mean + fits[0].mean[1:])])
     return inertias[0], fits[0]._replace(mean=mean), unseen
 

@@ -7,7 +7,8 @@ With i_L the current behind the rotor and behind the friction before the transmi
 
 An axis that always drives shows (1 + loss) times its load's inertia, and so does each part of a braking in which
 friction brakes more than is needed; the balance of a whole move cancels only the rest. How much of the friction lies
-before the transmission is not known: the inertia is that of the middle, and the interval holds those of both ends.
+before the transmission is not known: the inertia is that of the middle, and the interval holds those of both ends. A
+loss that is not clear may be there all the same, hidden by friction that brakes enough: the interval holds it, too.
 
 A load behind play glides: after a change of speed it runs along by itself, in the gap, for as long as a cruise lasts,
 and the motor then shows less friction than there is. From standstill to standstill nothing hides so, but the loss
@@ -22,6 +23,7 @@ import numpy as np
 
 from drive_env.trials.positioning import CYCLE
 from mechanics.arrays import Floats
+from tuning.identify.confidence import t_quantile
 from tuning.identify.momentum_balance import Motion, Solved, balance_rows, smoothed, solve, step
 
 if TYPE_CHECKING:
@@ -29,7 +31,8 @@ if TYPE_CHECKING:
 
 Cruises = tuple[tuple[int, int, int], ...]
 
-CLEAR = 3.0  # times its deviation: from here on it is taken out; below, the interval becomes wider
+CLEAR = 3.0  # times its deviation: from here on it is taken out of friction; below, inertia's interval becomes wider
+MOST = 2.0 / 3.0  # share of a loss that may hide: of a quarter of the transmitted torque
 BEFORE = (0.5, 0.0, 1.0)  # share of friction that lies before the transmission: the middle, and both ends
 TURNING = 0.15  # of a ramp, about standstill: there friction breaks away, and play is passed
 STEEP = 0.5  # of a ramp, on which a weight fades
@@ -41,10 +44,12 @@ class Loss(NamedTuple):
 
     while_braking: What it gives back while it brakes, per sample [A], less what it does so in cruises.
     share: By how much more it shows while it drives than while it brakes; 2 loss / (1 - loss).
+    is_clear: Whether the moves show it beyond chance.
     """
 
     while_braking: Floats
     share: float
+    is_clear: bool = True
 
     @property
     def loss(self) -> float:
@@ -57,7 +62,7 @@ class Loss(NamedTuple):
 
 
 def find_losses(did: Motion, cruises: Cruises, motor: Motor, friction: Floats) -> tuple[Loss, ...]:
-    """Return the loss for each of `BEFORE`, none if it is not clear.
+    """Return the loss for each of `BEFORE`: if not clear, the likely one, the most that may hide, and none.
 
     Args:
         did: What the axis did.
@@ -68,14 +73,18 @@ def find_losses(did: Motion, cruises: Cruises, motor: Motor, friction: Floats) -
     weights, moves = _parts(did, cruises)
     rows = balance_rows(did, weights, moves)
     found: list[Loss] = []
+    most: list[float] = []
     for before in BEFORE:
         braking = _while_braking(did, cruises, motor, before * friction)
         columns = np.column_stack([rows.columns[:, :4], rows.weights @ braking * CYCLE])
         solved = solve(columns, rows.charge, rows.duration, rows.moves)
-        if not found and not solved.mean[-1] > CLEAR * solved.spread[-1]:
-            return ()
-        found.append(Loss(braking, max(float(solved.mean[-1]), 0.0)))
-    return tuple(found)
+        share, spread = float(solved.mean[-1]), float(solved.spread[-1])
+        found.append(Loss(braking, max(share, 0.0), found[0].is_clear if found else share > CLEAR * spread))
+        most.append(float(np.clip(share + t_quantile(solved.freedom) * spread, 0.0, MOST)))
+    middle, behind, ahead = found
+    if middle.is_clear:
+        return middle, behind, ahead
+    return middle, behind._replace(share=most[1]), ahead._replace(share=0.0)
 
 
 def friction_of_whole_ways(did: Motion, cruises: Cruises, loss: Loss, inertia: float) -> Solved:
