@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import json
 import os
+import shutil
 import signal
 import struct
 import subprocess
@@ -16,6 +17,7 @@ import pytest
 from typer.testing import CliRunner
 
 from drive_env.commands import recorded_frames
+from drive_env.commands.captures import frames_of_capture
 from drive_env.commands.cli import app
 from drive_env.commands.frame_files import FrameFile, FrameLines
 from drive_env.master.can import port
@@ -151,15 +153,61 @@ def test_python_can_reads_the_lines(tmp_path):
             assert wrote.equals(read, timestamp_delta=1.1, check_channel=False, check_direction=False)
 
 
+def told(path):
+    with path.open("rb") as content:
+        return [
+            (round(x.timestamp, 6), x.arbitration_id, x.is_extended_id, x.is_remote_frame, x.is_error_frame, x.is_fd,
+             x.dlc, bytes(x.data)) for x in frames_of_capture(path.suffix, content)
+        ]  # fmt: skip
+
+
+@pytest.mark.parametrize("kinds", [("pcap",), ("nsecpcap",), ("pcapng",), ("nsecpcap", "pcapng")])
+def test_captures_are_read_as_wireshark_writes_them(tmp_path, kinds):
+    """Wireshark's editcap writes them anew, with its own blocks; a .pcapng of nanoseconds keeps that unit."""
+    if shutil.which("editcap") is None:
+        pytest.skip("needs editcap (Debian: wireshark-common)")
+    path = tmp_path / "ours.pcap"
+    write(path, FRAMES.values())
+    for kind in kinds:
+        made = tmp_path / f"{kind}.{'pcapng' if kind == 'pcapng' else 'pcap'}"
+        subprocess.run(["editcap", "-F", kind, path, made], check=True)
+        path = made
+    assert told(path) == [
+        (seconds + microseconds / 1e6, can_id & 0x1FFF_FFFF, bool(can_id >> 31), bool(can_id & 1 << 30),
+         bool(can_id & 1 << 29), bool(flags), size, bytes.fromhex(data))
+        for seconds, microseconds, can_id, size, flags, data in PACKETS.values()
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("ending", [".pcap", ".pcapng"])
+def test_a_capture_of_ours_comes_back_and_one_that_is_cut_off_is_refused(tmp_path, ending):
+    whole = write(tmp_path / f"a{ending}", [FRAMES["data"], FRAMES["empty"]])
+    frames, left_out = recorded_frames.read_frames(tmp_path / f"a{ending}", everything=True)
+    assert [(x.timestamp, x.arbitration_id, x.data) for x in frames] == [
+        (1.5, 0x181, b"\x37\x02"), (pytest.approx(1_700_000_000.000001, abs=1e-6), 0x080, b"")
+    ]  # fmt: skip
+    assert left_out == 0
+    path = tmp_path / f"cut{ending}"
+    for content, why in (
+        (whole[:-3], "it ends within a block, and may be cut off"),
+        (b"\0" * 64, f"it does not begin as a {ending} does"),
+        (whole.replace(struct.pack("<I", 227), struct.pack("<I", 113), 1).replace(
+            struct.pack("<HH", 227, 0), struct.pack("<HH", 113, 0), 1), "its link type is 113, not 227"),
+    ):  # fmt: skip
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=why):
+            recorded_frames.read_frames(path, everything=True)
+
+
 def test_a_channel_has_no_blanks(tmp_path):
     frame = can.Message(timestamp=1, arbitration_id=1, is_extended_id=False, channel="CAN 1")
     assert write(tmp_path / "a.log", [frame]) == b"(0000000001.000000) CAN1 001#\n"
 
 
 def test_replay_names_the_formats_that_it_reads(tmp_path):
-    (tmp_path / "a.pcap").write_bytes(b"")
-    done = CliRunner().invoke(app, ["frames", "replay", str(tmp_path / "a.pcap")])
-    assert done.exit_code == 2 and "'.pcap' is not one of .log, .blf, .asc" in done.stderr
+    (tmp_path / "a.txt").write_bytes(b"")
+    done = CliRunner().invoke(app, ["frames", "replay", str(tmp_path / "a.txt")])
+    assert done.exit_code == 2 and "'.txt' is not one of .log, .blf, .asc" in done.stderr
 
 
 GOOD = b"(1.0) can0 601#2B40600000000000\n"

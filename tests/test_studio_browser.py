@@ -71,14 +71,16 @@ def test_a_notice_on_a_phone_has_its_own_room_and_covers_nothing(tab):
     tab.open("/axes")
     tab.press("home")
     until(lambda: tab.told(), "a notice")
-    time.sleep(1.0)  # it has come to its place
-    tab.driver.execute_script("window.scrollTo(0, document.body.scrollHeight)")
-    time.sleep(0.5)
-    edges = """const box = (css) => [...document.querySelectorAll(css)].map((one) => one.getBoundingClientRect());
+    edges = """window.scrollTo(0, document.body.scrollHeight);
+        const box = (css) => [...document.querySelectorAll(css)].map((one) => one.getBoundingClientRect());
         return [Math.max(...box(".studio-card").map((one) => one.bottom)), box(".studio-footer")[0].top,
             box(".q-notification")[0].top, box(".q-notification").at(-1).bottom, box(".studio-stop")[0].top]"""
-    card, footer, notice, end, stop = tab.driver.execute_script(edges)
-    assert card <= footer <= notice < end <= stop
+
+    def has_own_room():
+        card, footer, notice, end, stop = tab.driver.execute_script(edges)
+        return card <= footer <= notice < end <= stop
+
+    until(has_own_room, "the cards end above the footer, and the notice lies in it, above the quick stop")
 
 
 @pytest.mark.slow

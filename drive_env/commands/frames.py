@@ -33,8 +33,7 @@ from drive_env.drives.arguments import LONGEST
 MOST_CHANNELS = 0xFFFF
 HIGHEST_ID, LONGEST_DATA = 0x7FF, 8  # of the frames that are sent
 SIGNAL_WAIT = 0.02  # s, the longest pause between two looks whether the user has pressed Ctrl-C
-FORMATS = (".log", ".blf", ".asc", ".csv", ".db", ".trc")
-WRITTEN = (*FORMATS, ".pcap", ".pcapng")
+FORMATS = (".log", ".blf", ".asc", ".csv", ".db", ".trc", ".pcap", ".pcapng")
 NOT_HELD = {".trc": "remote frames and no CAN FD", ".csv": "CAN FD", ".db": "CAN FD"}  # of python-can's writers
 
 frames_app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown")
@@ -162,7 +161,7 @@ def replay(
         from drive_env.master.can.dry_run import show_frame
         from drive_env.master.can.port import Port, open_bus
 
-        _check_format(file, ending_of(file), FORMATS)
+        _check_format(file, ending_of(file))
         if not file.is_file():
             raise ValueError(f"there is no file {file}")
         if not 0.0 < speed < math.inf:
@@ -262,15 +261,15 @@ def _take_interrupts() -> Any:
 
 def _check_new(file: Path, ending: str) -> None:
     """Raise ValueError for a file that could not be written."""
-    _check_format(file, ending, WRITTEN)
+    _check_format(file, ending)
     if not file.parent.is_dir():
         raise ValueError(f"there is no folder {file.parent}; choose another file")
     check_free(file)
 
 
-def _check_format(file: Path, ending: str, formats: tuple[str, ...]) -> None:
-    if ending not in formats:
-        raise ValueError(f"{file}: the ending gives the format, and {ending!r} is not one of {', '.join(formats)}")
+def _check_format(file: Path, ending: str) -> None:
+    if ending not in FORMATS:
+        raise ValueError(f"{file}: the ending gives the format, and {ending!r} is not one of {', '.join(FORMATS)}")
 
 
 def _is_held(message: Any, ending: str) -> bool:

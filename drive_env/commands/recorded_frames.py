@@ -83,6 +83,7 @@ def _frames_as_bytes(file: Path, everything: bool) -> bytes:
 def _frames(file: Path) -> Generator[Any, None, None]:
     import can
 
+    from drive_env.commands.captures import frames_of_capture
     from drive_env.commands.text_logs import LogError, frames_of_text, whole_lines
 
     ending, is_packed = ending_of(file), file.suffix.lower() == ".gz"
@@ -94,6 +95,8 @@ def _frames(file: Path) -> Generator[Any, None, None]:
     with gzip.open(file, "rb") if is_packed else file.open("rb") as content:
         if ending == ".blf":
             yield from can.BLFReader(content)
+        elif ending in (".pcap", ".pcapng"):
+            yield from frames_of_capture(ending, content)
         else:
             yield from frames_of_text(
                 ending, whole_lines(io.TextIOWrapper(content, encoding="utf-8-sig", errors="replace"))
