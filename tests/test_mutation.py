@@ -18,11 +18,16 @@ def test_every_row_has_files_of_its_own_and_tests_that_are_there():
 
 
 def test_tests_that_name_a_file_come_first():
-    table = [mutation.Row(("tuning/*",), ("test_swings.py", "test_fallback_gains.py"), ("tuning/auto/*",))]
-    assert mutation.tests_of("tuning/target.py", table) == ("test_swings.py", "test_fallback_gains.py")
+    table = [
+        mutation.Row(("tuning/*",), ("safety/test_swings.py", "master/test_fallback_gains.py"), ("tuning/auto/*",))
+    ]
+    assert mutation.tests_of("tuning/target.py", table) == ("safety/test_swings.py", "master/test_fallback_gains.py")
     assert mutation.tests_of("tuning/auto/design.py", table) == ()
-    named = [mutation.Row(("tuning/*",), ("test_swings.py", "test_fallback_gains.py"))]
-    assert mutation.tests_of("tuning/fallback_gains.py", named) == ("test_fallback_gains.py", "test_swings.py")
+    named = [mutation.Row(("tuning/*",), ("safety/test_swings.py", "master/test_fallback_gains.py"))]
+    assert mutation.tests_of("tuning/fallback_gains.py", named) == (
+        "master/test_fallback_gains.py",
+        "safety/test_swings.py",
+    )
 
 
 def test_what_is_only_read_by_a_type_checker_is_left_alone():
@@ -66,5 +71,7 @@ def test_a_sample_of_changes_is_noticed():
 def test_tests_that_fail_as_it_is_are_no_judges(monkeypatch):
     monkeypatch.setattr(mutation.Copy, "passes", lambda self, tests: False)
     mutant = mutation.Mutant("tuning/fallback_gains.py", 1, "core/NumberReplacer", 0)
-    with pytest.raises(ValueError, match=r"tests/test_fallback_gains.py fails as the sources are; mend it first"):
+    with pytest.raises(
+        ValueError, match=r"tests/master/test_fallback_gains.py fails as the sources are; mend it first"
+    ):
         next(mutation.run([mutant], TABLE))

@@ -122,7 +122,7 @@ class Rule(NamedTuple):
 
 
 # Standard dynamics (drive_env/loops/dynamics.py) on rigid axes, by inertia and lags alone, on drawn machines of all
-# drives and motors (tests/test_baseline_rule.py): at least 51 degrees, 16 dB and Ms 1.5 with the velocity filter
+# drives and motors (tests/tune/test_baseline_rule.py): at least 51 degrees, 16 dB and Ms 1.5 with the velocity filter
 # as shipped, 48 degrees and 10 dB with the slowest, 150 Hz, of which no drive tells; their variants keep theirs, too.
 # With the filter as shipped alone 0.48, 3 and 0.6 would do: J is half, and a trial is stopped by the ripple that an
 # encoder of 4096 counts makes, from a speed of 0.3 on. A current loop by its own lags (1100...1400 Hz) is no better.

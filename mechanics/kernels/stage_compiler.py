@@ -1,7 +1,7 @@
 """What Numba is spared while it compiles kernels: machine code of stages, and questions that it has answered before.
 
-Together they take two fifths off a cold start. They stand on private parts of Numba; `tests/test_stage_compiler.py`
-fails where a version has these no more.
+Together they take two fifths off a cold start. They stand on private parts of Numba;
+`tests/machines/test_stage_compiler.py` fails where a version has these no more.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""One communication cycle of machines with its energies summed tick by tick: what tests/test_soak.py runs.
+"""One communication cycle of machines with its energies summed tick by tick: what tests/bus/test_soak.py runs.
 
 It composes the stages as firmware/cycle.py does; a file of its own, so that it is compiled once.
 """
