@@ -337,6 +337,7 @@ def served_with_ready_file(path, *arguments):
         process.communicate()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals and rights")
 def test_a_script_finds_the_drives_by_the_ready_file_alone(tmp_path):
     path = tmp_path / "ready.json"

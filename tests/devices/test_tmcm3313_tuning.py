@@ -107,6 +107,7 @@ def test_an_episode_of_gain_tuning():
         env.close()
 
 
+@pytest.mark.slow
 def test_auto_commissions_and_certifies_load_detection_and_closed_loop(tmp_path, monkeypatch):
     result = call("auto", "--device", "tmcm3313", "--motor", NAME, "--load", "inertia", "--out", tmp_path / "out")
     assert result.exit_code == 0, result.output

@@ -248,6 +248,7 @@ def test_supply_sags_with_the_current_it_delivers():
     assert np.all(trace[0, 3, 1:] > trace[-1, 3, 1:])  # the sag follows the current, which has to rise first
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("is_dc", [0.0, 1.0])
 def test_the_stages_resistance_is_in_the_windings_circuit(is_dc):
     """Locked rotor: i = duty u_dc / R (1 - exp(-R t / L)), R with one switch of a phase, two of a brushed motor."""

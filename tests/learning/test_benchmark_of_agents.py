@@ -203,6 +203,7 @@ def test_every_run_has_its_row_and_the_table_has_them_all(benchmark):
     assert "| TorqueTracking-v1 | ppo | 2 | 0." in text and str(seeds.TEST[0]) in text
 
 
+@pytest.mark.slow
 def test_the_scores_of_a_baseline_are_those_of_its_episodes(benchmark):
     lanes = make_environments(TASK, EPISODES, autoreset_mode="Disabled")
     try:

@@ -122,6 +122,7 @@ def test_the_score_of_a_task_is_the_share_of_the_horizons_rewards():
     assert found.score == "score [0...1]" and found.values[found.score] == pytest.approx(sums)
 
 
+@pytest.mark.slow
 def test_a_policy_acts_on_the_drives_of_a_bus_as_in_process():
     lanes = make_environments("GantryBeam", 1)
     expert = baseline("expert", "GantryBeam", lanes.config, 2)

@@ -277,6 +277,7 @@ def test_a_bomb_is_refused_before_it_is_unpacked(bomb, memory):
         assert found.exit_code == 2 and "would unpack to 1000 MB" in found.output
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_a_directory_that_lies_gets_no_more_than_it_says(bomb, tmp_path, memory):
     """The directory says 100 bytes, the packed data are 1 GB."""

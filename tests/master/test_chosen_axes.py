@@ -123,6 +123,7 @@ def test_axes_of_a_machine_that_pull_at_one_thing_are_not_parted():
 
 
 # --- the view ---------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 @pytest.mark.parametrize("on_bus", [False, True])
 def test_what_is_done_to_chosen_axes_is_done_to_no_other(on_bus):
     whole = partly_wired()

@@ -99,6 +99,7 @@ def test_two_nodes_without_a_node_id_are_found_and_get_theirs(serve):
     assert served.restart() == [7, 9]  # they keep it
 
 
+@pytest.mark.slow
 def test_a_node_gets_another_node_id_with_its_reset(serve):
     served = serve(5, 6)
     code, said = served.run("node-id", "6", "--node", "5", "--yes")
@@ -177,6 +178,7 @@ def test_what_a_node_refuses_is_said(serve):
     assert "no LSS slave has the identity 1:2:3:4" in said
 
 
+@pytest.mark.slow
 def test_after_an_error_all_slaves_wait(serve):
     served = serve(255, 6)
     assert served.run("node-id", "8", "--identity", show(FIRST), "--yes", "--reset")[0] == 2

@@ -100,6 +100,7 @@ def test_a_node_that_was_stopped_is_woken_to_be_put_back(drive, bus, caplog):
     assert not [record for record in caplog.records if record.levelno >= logging.ERROR]
 
 
+@pytest.mark.slow
 def test_a_node_that_is_gone_costs_a_few_waits_and_a_line_for_each_matter(drive, bus, caplog):
     drives = used(bus)
     asked = []

@@ -106,6 +106,7 @@ def test_light_and_dark(tab):
 
 
 # --- axes ---------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_enabled_moved_and_disabled(tab):
     at_rest(tab)
     tab.press("enable")
@@ -318,6 +319,7 @@ def choose(tab, name, text):
 
 
 # --- dictionary ---------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_an_object_is_found_written_and_rolled_back(tab, tmp_path):
     at_rest(tab)
     tab.driver.execute_cdp_cmd("Browser.setDownloadBehavior", {"behavior": "allow", "downloadPath": str(tmp_path)})

@@ -223,6 +223,7 @@ def test_the_last_five_lie_under_the_newest(desk):
 
 
 # --- responses ----------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_margins_follow_the_gains_after_a_response_and_the_slider_writes_nothing(desk):
     now = gains_of(desk)
     assert StiffnessSlider(panel_of(desk), None).designed.startswith("No response of the velocity loop yet")

@@ -144,6 +144,7 @@ def slide(tab, name="slider-velocity_p", times=12):
         tab.key(Keys.ARROW_RIGHT)
 
 
+@pytest.mark.slow
 def test_a_slider_changes_the_gain_that_the_drive_shows_and_undo_takes_it_back(tab):
     """What of it is in the drive: tests/studio/test_studio_tune.py, and the next one."""
     tab.open("/tune")

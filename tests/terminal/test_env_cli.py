@@ -62,6 +62,7 @@ def run(shared, monkeypatch):
 
 
 # --- scan, get, set -----------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_scan_finds_and_names_the_nodes(run):
     code, out, _ = run("scan", "--last", 10, "--timeout", 1)
     assert code == DONE

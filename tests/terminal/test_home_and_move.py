@@ -121,6 +121,7 @@ def test_a_move_ends_where_it_says_and_gives_the_speed_back(served, run):
     assert float(drives.machine.rotor_angle[0]) == pytest.approx(angle, abs=0.1)
 
 
+@pytest.mark.slow
 def test_homing_finds_the_switch_s_edge_and_gives_the_method_back(served, run):
     drives = served[0]
     found = run("home", "--method", "17", "--yes", "--json")

@@ -63,6 +63,7 @@ def test_measured_margins_are_those_of_the_linear_model(measured, load):
         assert found.ms == pytest.approx(expected.ms, rel=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("load", ["inertia", "two_mass"])
 def test_trusted_lines_lie_on_the_model_also_those_of_the_trace(measured, load):
     target, plants, gains, response = measured[load]

@@ -86,6 +86,7 @@ def test_auto_names_late_syncs_and_writes_no_wiring(late, tmp_path):
     assert any(LATE in one for one in axis.reservations)
 
 
+@pytest.mark.slow
 def test_a_response_or_the_envelope_that_stops_it_names_late_syncs_first(late):
     """The envelope stopped it for a travel that it would never have left in time."""
     with late.open() as target:

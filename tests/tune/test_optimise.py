@@ -493,6 +493,7 @@ def is_interrupted(monkeypatch):
     monkeypatch.setattr(optimise_module, "optimise", pressed)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("more", "says"),
     [

@@ -207,6 +207,7 @@ def test_gains_that_are_none_are_the_tuners_mistake(gains):
     assert row.failed and "a tuner returns an Outcome with integer gains of shape (4, 5)" in row.note
 
 
+@pytest.mark.slow
 def test_a_comparison_follows_from_its_seed_and_from_nothing_else():
     def tuner(target, rng):
         return search_tuner(target, rng, sampler="random", trials=6)
