@@ -43,7 +43,6 @@ SPEED_PPS = 1_000_000
 SLOW_PPS = 200_000  # no load comes to its end stops
 DEVICE_SPEED = "180 rpm"  # that every device's usual motor reaches in open loop, too
 ARM = "robot"  # six joints
-PER_LOAD = ("drive alone", "packed mj_step alone", "bound", "emulator", "share of bound", "x real time")
 
 
 def best_time(function: Callable[[], Any], repetitions: int = 5) -> float:
@@ -153,13 +152,11 @@ def bound(
     }
 
 
-def throughput(sizes: tuple[int, ...], progress: Progress) -> list[dict[str, float]]:
+def throughput(sizes: tuple[int, ...]) -> list[dict[str, float]]:
     """Return steps of 1 ms per second: in one call for many milliseconds, and as an environment makes them."""
-    threads = (1, 2)
-    rows = []
-    task = progress.add_task("throughput", total=len(sizes) * len(threads))
+    rows: list[dict[str, float]] = []
     for machines in sizes:
-        for count in threads:
+        for count in (1, 2):
             drives = running_drives(machines, count)
             cycles = max(10, min(400, 100_000 // machines))
             whole = best_time(lambda d=drives, n=cycles: d.advance(n * 1e-3), 3)
@@ -173,16 +170,18 @@ def throughput(sizes: tuple[int, ...], progress: Progress) -> list[dict[str, flo
                         d.read(name)
 
             env = best_time(env_steps, 3)
+            advance = cycles * machines / whole
+            one = advance if count == 1 else rows[-1]["advance"]
             rows.append(
                 {
                     "machines": machines,
                     "threads": count,
-                    "advance_steps_per_s": cycles * machines / whole,
-                    "env_steps_per_s": steps * machines / env,
+                    "advance": advance,
+                    "over one thread": advance / one,
+                    "as an environment": steps * machines / env,
                 }
             )
             drives.close()
-            progress.advance(task)
     return rows
 
 
@@ -223,7 +222,39 @@ def start_up() -> dict[str, float]:
     return result
 
 
-def print_table(console: Console, title: str, columns: tuple[str, ...], rows: list[tuple[Any, ...]]) -> None:
+def parts_of(quick: bool) -> dict[str, Callable[[], Any]]:
+    """Return what measures each table: by its title, figures by name, rows by name, or rows."""
+    parts: dict[str, Callable[[], Any]] = {
+        "ns per drive and tick": ticks,
+        "us per axis and ms, 64 machines, 1 thread": bound,
+        "ns per drive and tick, by device, 8 lanes": device_ticks,
+        "64 arms of six axes, 1 thread: us per axis and ms": arms,
+        "per load: us per axis and ms, 64 machines, 1 thread, 5 physics steps per ms": lambda: {
+            load: {"axes": row.num_axes} | bound(load) for load, row in LOADS.items()
+        },
+        "bus": bus.figures,
+        "EtherCAT": ethercat.figures,
+        "studio": studio.figures,
+        "environments": environments.figures,
+        "gain tuning": gain_tuning.figures,
+        "training": training.figures,
+        "sweeps": lambda: sweeps.figures(quick),
+        "construction": lambda: construction(quick),
+    }
+    if not quick:
+        parts["start-up"] = start_up
+    parts[f"1 ms steps per second, {LOAD}"] = lambda: throughput(SIZES[:-1] if quick else SIZES)
+    return parts
+
+
+def print_table(console: Console, title: str, figures: Any) -> None:
+    """Print figures by name as two columns, rows by name or rows with their own."""
+    if isinstance(figures, list):
+        columns, rows = tuple(figures[0]), [tuple(row.values()) for row in figures]
+    elif isinstance(first := next(iter(figures.values())), dict):
+        columns, rows = ("name", *first), [(name, *row.values()) for name, row in figures.items()]
+    else:
+        columns, rows = ("what", "figure"), list(figures.items())
     table = Table(*columns, title=title, title_justify="left")
     for row in rows:
         table.add_row(*(f"{cell:,.3g}" if isinstance(cell, float) and abs(cell) < 1000 else f"{cell:,.0f}"
@@ -232,85 +263,23 @@ def print_table(console: Console, title: str, columns: tuple[str, ...], rows: li
 
 
 def main() -> None:
+    """Measure, print each table as soon as it is there, and write them all as JSON."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("benchmarks/results"), help="folder of the JSON file")
     parser.add_argument("--quick", action="store_true", help="leave out the largest size and the cold compile")
+    parser.add_argument("--only", default="", metavar="WORD", help="measure only the tables with this in their title")
     options = parser.parse_args()
+    parts = {title: part for title, part in parts_of(options.quick).items() if options.only in title}
+    if not parts:
+        parser.error(f"--only {options.only}: no table; there are {', '.join(parts_of(options.quick))}")
     console = Console()
     warnings.simplefilter("ignore", MisfitWarning)  # a load may be heavy for a motor: it is the time that counts
-    sizes = SIZES[:-1] if options.quick else SIZES
+    result: dict[str, Any] = {}
     with Progress(console=console, transient=True) as progress:
-        parts = (
-            "firmware, bound, devices, arms, loads, bus, EtherCAT, studio, environments, training, sweeps, construction"
-        )
-        parts += ", start-up"
-        task = progress.add_task(parts, total=parts.count(",") + len(LOADS))
-        result: dict[str, Any] = {"ns per drive and tick": ticks()}
-        progress.advance(task)
-        result["us per axis and ms, 64 machines, 1 thread"] = bound()
-        progress.advance(task)
-        result["ns per drive and tick, by device, 8 lanes"] = device_ticks()
-        progress.advance(task)
-        result["64 arms of six axes, 1 thread"] = arms()
-        progress.advance(task)
-        result["per load"] = {}
-        for load in LOADS:
-            result["per load"][load] = bound(load)
-            progress.advance(task)
-        result["bus"] = bus.figures()
-        progress.advance(task)
-        result["EtherCAT"] = ethercat.figures()
-        progress.advance(task)
-        result["studio"] = studio.figures()
-        progress.advance(task)
-        result["environments"] = environments.figures() | gain_tuning.figures()
-        progress.advance(task)
-        result["training"] = training.figures()
-        progress.advance(task)
-        result["sweeps"] = sweeps.figures(options.quick)
-        progress.advance(task)
-        result["construction"] = construction(options.quick)
-        progress.advance(task)
-        if not options.quick:
-            result["start-up"] = start_up()
-        progress.advance(task)
-        result["throughput"] = throughput(sizes, progress)
-    for name in (
-        "ns per drive and tick",
-        "us per axis and ms, 64 machines, 1 thread",
-        "ns per drive and tick, by device, 8 lanes",
-        "bus",
-        "EtherCAT",
-        "studio",
-        "environments",
-        "training",
-        "sweeps",
-        "construction",
-        "start-up",
-    ):
-        if name in result:
-            print_table(console, name, ("what", "figure"), list(result[name].items()))
-    print_table(
-        console,
-        "64 arms of six axes, 1 thread: us per axis and ms",
-        ("device", *PER_LOAD, "arm-seconds per second"),
-        [(name, *row.values()) for name, row in result["64 arms of six axes, 1 thread"].items()],
-    )
-    print_table(
-        console,
-        "per load: us per axis and ms, 64 machines, 1 thread, 5 physics steps per ms",
-        ("load", "axes", *PER_LOAD),
-        [(load, LOADS[load].num_axes, *(row[key] for key in PER_LOAD)) for load, row in result["per load"].items()],
-    )
-    rows = [tuple(row.values()) for row in result["throughput"]]
-    print_table(
-        console, f"1 ms steps per second, {LOAD}", ("machines", "threads", "advance", "as an environment"), rows
-    )
-    by_size = {(row["machines"], row["threads"]): row["advance_steps_per_s"] for row in result["throughput"]}
-    scaling = {f"{n} machines": by_size[n, 2] / by_size[n, 1] for n in sizes if n > 64}
-    print_table(console, "two threads over one", ("size", "ratio"), list(scaling.items()))
+        for title in progress.track(parts, description="tables"):
+            result[title] = parts[title]()
+            print_table(progress.console, title, result[title])
     result |= {
-        "two threads over one": scaling,
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "machine": f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores",
         "versions": {name: version(name) for name in ("drive-env", "numpy", "numba", "mujoco")},

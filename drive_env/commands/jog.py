@@ -79,15 +79,15 @@ def jog(
             one = OneAxis(drives, bus.one_axis)
             movement = _asked_for(one, speed, by, duration)
             start = one.position()
+            meant = _speed_in_words(speed, movement.velocity, description.dictionary.find(one.target), one.scale)
             if dry_run:
-                what = f"turn at {speed} for {duration:g} s" if by is None else f"turn by {by} at {speed}"
+                what = f"turn for {duration:g} s at {meant}" if by is None else f"turn by {by} at {meant}"
                 one.tell_plan(what, start, is_dry=True, json=json)
                 return
             outcome = one.carry_out(lambda: movement.run(one, is_recorded=files is not None))
             if files is not None and outcome.trace is not None:
                 one.write_recording(files, outcome.trace)
         moved = outcome.end - start
-        meant = _speed_in_words(speed, movement.velocity, description.dictionary.find(one.target), one.scale)
         share = moved / movement.way if one.has_position else one.turned / movement.velocity
         stopped = _verdict(share, outcome, meant)
         if json:
@@ -161,7 +161,7 @@ def _speed_in_words(speed: str, velocity: int, entry: Entry, scale: Scale) -> st
         return f"{text}, in a unit that the EDS does not tell"
     if quantities.is_quantity(speed) or text.endswith(" rpm"):
         return text
-    return f"{text}; if {speed} rpm are meant, write '{speed} rpm'"
+    return f"{text} (if {speed} rpm are meant, write '{speed} rpm')"
 
 
 def _turn(one: OneAxis, velocity: int, duration: float, is_recorded: bool) -> Any:

@@ -240,7 +240,11 @@ def test_a_dry_run_reads_what_is_says_what_would_be_and_changes_nothing(run, sha
     }  # fmt: skip
     code, out, _ = run("jog", "60 rpm", "--for", "2", "--dry-run")
     assert code == DONE
-    assert "would be enabled, turn at 60 rpm for 2 s, and be switched off again (dry run: nothing was done)" in out
+    assert (
+        "would be enabled, turn for 2 s at 65536 pps (60 rpm), and be switched off again (dry run: nothing was done)"
+        in out
+    )
+    assert "at 60 pps (0.0549316 rpm) (if 60 rpm are meant, write '60 rpm')" in run("jog", "60", "--dry-run")[1]
     assert "moved" not in out
     assert {name: machine.read(name).tolist() for name in before} == before
 

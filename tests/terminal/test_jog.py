@@ -107,12 +107,12 @@ def test_a_speed_without_a_unit_is_told_in_rpm_where_the_axis_hardly_moved(jog):
     found = run("30", "--for", "0.1")
     assert abs(drives.read(0x6064)[0] - before) < 16
     assert found.exit_code == 1, found.output
-    assert "The speed was 30 pps (0.0274658 rpm); if 30 rpm are meant, write '30 rpm'. Else check" in found.stderr
+    assert "The speed was 30 pps (0.0274658 rpm) (if 30 rpm are meant, write '30 rpm'). Else check" in found.stderr
 
 
 @pytest.mark.parametrize(
     ("speed", "text"),
-    [("300", "300 pps (0.274658 rpm); if 300 rpm are meant, write '300 rpm'"), ("300 pps", "300 pps (0.274658 rpm)")],
+    [("300", "300 pps (0.274658 rpm) (if 300 rpm are meant, write '300 rpm')"), ("300 pps", "300 pps (0.274658 rpm)")],
 )
 def test_a_speed_in_words(speed, text):
     from drive_env.commands.jog import _speed_in_words
@@ -120,7 +120,7 @@ def test_a_speed_in_words(speed, text):
 
     entry = find_device("tmcm1636").new_dictionary().find(0x60FF)
     assert _speed_in_words(speed, 300, entry, 65536.0) == text
-    assert _speed_in_words("300", 300, entry, None) == "300 pps; if 300 rpm are meant, write '300 rpm'"
+    assert _speed_in_words("300", 300, entry, None) == "300 pps (if 300 rpm are meant, write '300 rpm')"
     assert (
         _speed_in_words("300", 300, dataclasses.replace(entry, unit=""), None)
         == "300, in a unit that the EDS does not tell"
