@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def checked_origin(file: Path, *, unchecked: bool) -> tuple[Identity | None, int | None]:
-    """Return from which drive and axis a file was read, None where it does not say; raise if it is not as written."""
+    """Return the drive and axis that a file was read from, None if it does not name them; raise if it was changed."""
     table = _read_toml(file)
     check_seal(file, table, unchecked=unchecked)
     identity = table.get("identity")
@@ -32,7 +32,7 @@ def checked_origin(file: Path, *, unchecked: bool) -> tuple[Identity | None, int
 
 
 def parameters_text(drives: DescribedAxes, axis: int, values: Mapping[tuple[int, int], int]) -> str:
-    """Return parameters as TOML; the objects' names are comments, their index is what counts."""
+    """Return parameters as TOML; the index counts, the objects' names are comments."""
     known = drives.description
     lines = [
         f"# Parameters of node {drives.nodes[0]}. The check sum at the end shows a change, and restore refuses a "
