@@ -46,9 +46,11 @@ KINDS = (LOAD_ANGLE, PID_ON_RAMP, PID_ALONE)
 class ClosedLoop(NamedTuple):
     """A loop that an open-loop stepper's drive may close.
 
-    kind: One of `KINDS`. mode: Its mode (`Role.LOOP_MODE`). gains: Names of the gains that act only in it, P first,
-    with the gains whose objects they are: one object may be P of one loop and D of another. first: Start values of a
-    search, by the first of these names; others start as commissioned.
+    kind: One of `KINDS`.
+    mode: Its mode (`Role.LOOP_MODE`).
+    gains: Names of the gains that act only in it, P first, with the gains whose objects they are: one object may be P
+        of one loop and D of another.
+    first: Start values of a search, by the first of these names; others start as commissioned.
     """
 
     kind: str
