@@ -18,9 +18,10 @@ class Margins(NamedTuple):
     gain_db: Least factor, in dB, by which the gain may rise before the loop oscillates; infinite if the phase never
         reaches -180 degrees with a gain below 1; nan if it may do so at frequencies that are not trusted, with more
         gain; negative: by how much the gain must fall for the loop to be stable.
-    crossover_hz: Lowest frequency from which on the gain is below 1 until the next crossing [Hz]. bandwidth_hz:
-    Frequency at which the closed loop's gain has fallen by 3 dB [Hz]. ms: Greatest sensitivity |1 / (1 + L)|. phase_hz,
-    gain_hz: Frequencies of phase_deg and gain_db [Hz]: with a resonance there are several crossings.
+    crossover_hz: Lowest frequency from which on the gain is below 1 until the next crossing [Hz].
+    bandwidth_hz: Frequency at which the closed loop's gain has fallen by 3 dB [Hz].
+    ms: Greatest sensitivity |1 / (1 + L)|.
+    phase_hz, gain_hz: Frequencies of phase_deg and gain_db [Hz]: with a resonance there are several crossings.
     """
 
     phase_deg: float

@@ -40,9 +40,12 @@ class LoopRates(NamedTuple):
 class LinearMachines(NamedTuple):
     """Machines in continuous time: dx/dt = A x + B u, with the voltages u of the axes [V].
 
-    A: (machines, states, states). B: (machines, states, axes). current, speed: Rows that give the current [A] and speed
-    [rad/s] of each rotor from the states, (machines, axes, states). supply: Supply voltage of each axis [V], (machines,
-    axes). velocity_filter: Corner of each axis's velocity filter [Hz], (machines, axes).
+    A: (machines, states, states).
+    B: (machines, states, axes).
+    current, speed: Rows that give the current [A] and speed [rad/s] of each rotor from the states,
+        (machines, axes, states).
+    supply: Supply voltage of each axis [V], (machines, axes).
+    velocity_filter: Corner of each axis's velocity filter [Hz], (machines, axes).
     """
 
     A: Floats
