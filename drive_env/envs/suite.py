@@ -21,7 +21,8 @@ TERMS = ("tracking", "speed", "load", "carried", "effort", "smoothness", "trip")
 class SuiteTask:
     """A task of the suite.
 
-    environment: The environment that it configures. about: Description of the task.
+    environment: The environment that it configures.
+    about: Description of the task.
     steps: Actions of an episode.
     solved: Score above which an agent surpasses the expert, 0...1; the reward threshold is that times `steps`.
     options: The configuration.

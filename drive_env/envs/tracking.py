@@ -65,9 +65,10 @@ class Task:
 
     mode: csp, csv or cst.
     trajectory: A row of trajectories.TRAJECTORIES.
-    amplitude: Amplitude of the trajectory, and the scale of positions [rev of the motor]. speed: Its highest speed, and
-    the scale of velocities [rev/s]. joint: Number of the load's joint with a sensor of the master; None: no such
-    sensor. length: Length of its pendulum, from the pivot to the bob [m].
+    amplitude: Amplitude of the trajectory, and the scale of positions [rev of the motor].
+    speed: Its highest speed, and the scale of velocities [rev/s].
+    joint: Number of the load's joint with a sensor of the master; None: no such sensor.
+    length: Length of its pendulum, from the pivot to the bob [m].
     fall: Angle of that joint that ends the episode [rad].
     together: Whether all axes follow one trajectory, as the ends of one beam must.
     """

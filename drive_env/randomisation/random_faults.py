@@ -18,7 +18,8 @@ class RandomFaults:
     """The distribution of faults in a set of distributions.
 
     probability: Of an episode that it has a fault, 0...1.
-    names: The possible faults, with equal probability. at: Earliest and latest begin, from the episode's start [s].
+    names: The possible faults, with equal probability.
+    at: Earliest and latest begin, from the episode's start [s].
     duration: Shortest and longest [s]; None: until the episode ends.
     ranges: Low and high of a fault's parameter by "fault.parameter"; the others have their defaults.
     """
