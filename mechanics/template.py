@@ -28,10 +28,12 @@ class Rows(NamedTuple):
 
     merged: Friction of the load computed together with a bearing's -> axis, its motion per the rotor's. apart:
     Frictions with a row, in the numbering of `LoadValues`: the axes' bearings, and those that are not merged.
-    num_frictions: Their number. motion: Motions of these frictions and of the contacts, from the joints, shape
-    (num_frictions + contacts, D). position: Positions that press each axis's switches, shape (axes, D). disturbance:
-    Shape (D,). carries: Contact whose force increases each friction, or -1, shape (num_frictions,). jammed: For each
-    axis, the friction that holds its load, and its torque or force per rotor torque.
+    num_frictions: Their number.
+    motion: Motions of these frictions and of the contacts, from the joints, shape (num_frictions + contacts, D).
+    position: Positions that press each axis's switches, shape (axes, D).
+    disturbance: Shape (D,).
+    carries: Contact whose force increases each friction, or -1, shape (num_frictions,).
+    jammed: For each axis, the friction that holds its load, and its torque or force per rotor torque.
     """
 
     merged: dict[int, tuple[int, float]]
