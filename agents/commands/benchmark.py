@@ -141,7 +141,7 @@ def _check(context: typer.Context, path: Path, trust: bool) -> None:
 
 
 def _check_alone(context: typer.Context, name: str, others: tuple[str, ...]) -> None:
-    """Raise ValueError for options that another one leaves nothing to do."""
+    """Raise ValueError for options that have no effect with another one."""
     given = [one for one in given_options(context) if one in others]
     if given:
         raise ValueError(f"{name} takes no {', '.join(given)}; leave it out")

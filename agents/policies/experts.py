@@ -32,7 +32,7 @@ class Expert:
     """Base of the experts.
 
     Args:
-        configuration: Of the environment.
+        configuration: The environment's configuration.
     """
 
     def __init__(self, configuration: Any) -> None:
@@ -40,11 +40,11 @@ class Expert:
         self._machine: dict[str, Floats] = {}
 
     def told(self, parameters: Mapping[str, Floats], mask: Any) -> None:
-        """Take the parameters of machines that begin, or whose payload has changed, where the mask is true.
+        """Store the parameters of starting machines, or of those whose payload has changed, where the mask is true.
 
         Args:
             parameters: By name, (environments,) each.
-            mask: Which, (environments,).
+            mask: The machines, (environments,).
         """
         for name, values in parameters.items():
             kept = self._machine.setdefault(name, np.array(values, float))
@@ -52,7 +52,7 @@ class Expert:
         self.reset(mask)
 
     def parameter(self, name: str, nominal: float) -> Floats:
-        """Return a parameter of all machines; where it was not told, the nominal one."""
+        """Return a parameter of all machines; the nominal one if it is unknown."""
         return np.asarray(self._machine.get(name, nominal), float)
 
     def reset(self, mask: Any = None) -> None:
