@@ -1,9 +1,9 @@
 """Training with Stable-Baselines3: one seed gives the same agent on the same machine, and a run can be resumed.
 
 A run is cut into segments, at whose ends a checkpoint is written and every environment begins a new episode with seeds
-of the segment. So a resumed run equals an uninterrupted one to the last digit: what cannot be saved, the emulated
-machines in the middle of their episodes, is begun anew in both. Not equal are times, and a run with other numbers of
-threads of torch, which may add up in another order.
+of the segment. So a resumed run equals an uninterrupted one to the last digit: the emulated machines in the middle of
+their episodes, which cannot be saved, are reset in both. Times differ, and so does a run with another number of torch
+threads, which may sum in another order.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ from tuning.runs.provenance import check_begun
 
 logger = logging.getLogger(__name__)
 
-# Torch's and NumPy's random numbers are a process's: of two trainings at once in it, none would be what it is alone.
+# Torch's and NumPy's random generators are global: two trainings at once in a process would disturb each other.
 _ALONE = threading.Lock()
-IMITATION = 1_000_000  # a segment's number that no run has, for seeds
-# "constant" is SB3's word for SAC's automatic entropy and others.
+IMITATION = 1_000_000  # number for the seeds of an imitation, beyond all segments
+# Options that may be schedules.
 _SCHEDULED = ("learning_rate", "clip_range", "clip_range_vf")
 # Keys whose value SB3 wants as a whole number, though YAML may say 1e5.
 _WHOLE = ("n_steps", "batch_size", "n_epochs", "buffer_size", "learning_starts", "train_freq", "gradient_steps")
