@@ -1,7 +1,7 @@
 """Faster compilation of kernels: no machine code for single stages, and cached answers inside Numba.
 
-Together they save two fifths of a cold start. They use private parts of Numba; `tests/test_stage_compiler.py` fails
-with a version that lacks these.
+Together they take two fifths off a cold start. They stand on private parts of Numba; `tests/test_stage_compiler.py`
+fails where a version has these no more.
 """
 
 from __future__ import annotations
