@@ -254,7 +254,6 @@ def _sampler(known: Any, seed: int) -> Any:
 
 
 def _trained(task: _TrainingTask) -> _Scored:
-    """Run a task."""
     from agents.evaluation.evaluation import evaluate
     from agents.policies.policy import policy_of
 

@@ -160,7 +160,6 @@ def _short(task: str) -> str:
 
 
 def _curves(policies: Mapping[str, Sequence[Row]]) -> list[str]:
-    """Return the policies that have a curve."""
     return [policy for policy, rows in policies.items() if rows[0].kind == TRAINED]
 
 

@@ -94,7 +94,6 @@ def benchmark(
 def _trainings(
     tasks: list[str] | None, algorithms: list[str], seeds: int, steps: int | None, trust: bool
 ) -> list[BenchmarkRun]:
-    """Return the runs of baselines and trainings."""
     from agents.benchmark.results import TRAINED
     from agents.benchmark.runs import BenchmarkRun, baseline_runs, suite_task
     from agents.training import hyperparameters

@@ -393,7 +393,6 @@ def _seen(observation: Any) -> Any:
 
 
 def _of_environment(info: Mapping[str, Any], lane: int) -> dict[str, Any]:
-    """Return the numbers and texts of an info for one environment."""
     found = {}
     for key, value in info.items():
         if key.startswith("_") or isinstance(value, Mapping) or np.ndim(value) < 1:

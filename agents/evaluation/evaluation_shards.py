@@ -78,7 +78,6 @@ def _run(task: _Round) -> list[Episode]:
 
 
 def _is_of(task: _Round, found: Any) -> bool:
-    """Return whether episodes are those of a round."""
     seeds = [episode.seed for episode in found if len(episode.observations) == len(episode.actions) + 1]
     return seeds == list(range(task.seed, task.seed + task.episodes))
 

@@ -180,7 +180,6 @@ class Wire:
             queue.append(waiting)
 
     def _disturbing(self, frame: Frame) -> Sequence[Faults]:
-        """Return the faults that apply to a frame."""
         if not self.faults and not self.injected:
             return ()
         return [one for one in (self.faults, *self.injected) if one and (not one.only or frame.can_id in one.only)]

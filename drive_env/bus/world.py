@@ -296,7 +296,6 @@ class World:
 
     # --- inside ---------------------------------------------------------------------------------------------------
     def _next_answer(self) -> float:
-        """Return when the next SDO answer is ready [s]."""
         return min((node.next_answer for node in self._answering), default=math.inf)
 
     def _room_of(self, node_id: int) -> int:

@@ -180,7 +180,6 @@ def _check_name(file: Path, ending: str) -> None:
 
 
 def _write(file: Path, text: str, said: str) -> None:
-    """Write a file and report its source, or print it."""
     from drive_env.whole_file import write_whole
 
     if str(file) == "-":

@@ -99,7 +99,6 @@ def new_motor(
 
 
 def _list_numbers() -> None:
-    """Print the numbers by kind of motor."""
     from drive_env import motors
 
     brushed = motors.OF_DC
@@ -128,7 +127,6 @@ def _list_numbers() -> None:
 
 
 def _given(texts: list[str]) -> dict[str, Printed]:
-    """Return the numbers of the command line."""
     found: dict[str, Printed] = {}
     for text in texts:
         name, _, value = (part.strip() for part in text.partition("="))
@@ -137,7 +135,6 @@ def _given(texts: list[str]) -> dict[str, Printed]:
 
 
 def _read(name: str, text: str) -> dict[str, Printed]:
-    """Return a number by its name in the file."""
     from drive_env.motors.data_sheet import read_number
 
     key, value = read_number(name, text)

@@ -268,7 +268,6 @@ def _exchange(
 
 
 def _tell_plan(differences: list[Any], scale: Scale, node: int, *, store: bool, json: bool) -> None:
-    """Print the parameters that would be written."""
     if json:
         rows = [_row(difference, scale) for difference in differences]
         print_json({"would change": rows, "would store": store, "written": 0})

@@ -79,7 +79,6 @@ def scan(
 
 
 def _scan_ethercat(interface: str | None, channel: str | None, json: bool) -> None:
-    """Print the slaves of a segment."""
     from drive_env.devices import device_of
     from drive_env.master.ethercat.state_names import state_name
     from drive_env.master.ethercat_drives import open_frames

@@ -273,7 +273,6 @@ def _widest(entry: Entry, field: str) -> int:
 
 
 def _values(motor: Motor) -> dict[str, float]:
-    """Map fields of the record to SI values."""
     brushed = motor.kind == "dc"
     ramp = TORQUE * motor.rated_torque / (ROTORS * motor.inertia)
     return {

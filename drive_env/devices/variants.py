@@ -246,7 +246,6 @@ def _section(eds: configparser.RawConfigParser, index: int, sub: int) -> str:
 
 
 def _eds(row: Mapping[str, Any]) -> dict[str, str]:
-    """Return a row's keys and values in the form of the EDS."""
     found = {_KEYS[key]: str(value) for key, value in row.items() if key in _KEYS}
     if "type" in row:
         found["DataType"] = f"0x{TYPES[row['type']]:04X}"

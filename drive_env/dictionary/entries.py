@@ -113,7 +113,6 @@ def written_objects(path: Path | EdsText, indices: Iterable[int]) -> dict[int, O
 
 
 def _source(path: Path | EdsText) -> tuple[str, str]:
-    """Return an EDS's text and its origin."""
     return (path.text, path.name) if isinstance(path, EdsText) else (_read_text(path), str(path))
 
 

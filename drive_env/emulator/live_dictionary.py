@@ -167,7 +167,6 @@ class LiveDictionary:
             self._snapshot = None
 
     def _count_scale_change(self, before: units.Context) -> None:
-        """Count a change if the scales differ from those before."""
         # The peak current of a drive that does not need it is nan, and stays unchanged.
         after = self.context()
         if not all(np.array_equal(one, other, equal_nan=True) for one, other in zip(before, after, strict=True)):

@@ -442,7 +442,6 @@ class GainTuning(VectorEnvironment):
         return np.asarray(costs.reshape(self.num_envs, -1).max(axis=1))
 
     def _stopped(self, tried: Trial) -> Mask:
-        """Return in which environments a trial was stopped, on any axis."""
         return np.asarray(tried.aborted.any(axis=0).reshape(self.num_envs, -1).any(axis=1))
 
     def _take(self, mask: Mask, gains: Integers, tried: Trial, measured: Floats, better: Mask | None = None) -> None:

@@ -97,7 +97,6 @@ class DriveVecEnv(VecEnv):  # type: ignore[misc]
 
 
 def _of_environment(info: Mapping[str, Any], lane: int) -> Info:
-    """Return one environment's part of an info."""
     found: Info = {}
     for key, value in info.items():
         if key.startswith("_") or value is None or (f"_{key}" in info and not info[f"_{key}"][lane]):

@@ -144,7 +144,6 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
 
     # --- what it may replace --------------------------------------------------------------------------------------
     def _new_drives(self, num_envs: int) -> Any:
-        """Return the machines of the configuration, of all environments."""
         from drive_env.emulator.emulated_drives import EmulatedDrives
 
         c = self.config
@@ -155,7 +154,6 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
         return None if self._pictures is None else self._pictures.draw(lane)
 
     def _close_environments(self) -> None:
-        """Release drives and pictures."""
         if self._pictures is not None:
             self._pictures.close()
         if self._owned:
@@ -506,7 +504,6 @@ def one_of(tree: Any) -> Any:
 
 
 def _restored(kind: Any, num_envs: int, how: dict[str, Any], state: State, spec: EnvSpec | None) -> VectorEnvironment:
-    """Return newly made environments, restored to a state."""
     made: VectorEnvironment = kind(num_envs, **how)
     made.restore_state(state)
     made.spec = spec

@@ -340,8 +340,6 @@ class SlaveController:
         return locked
 
     def _react(self, address: int, end: int, data: bytes | bytearray, now: int) -> None:
-        """Act on a write to the registers from `address` to `end`."""
-
         def has(first: int, size: int) -> bool:
             return address < first + size and end > first
 

@@ -175,7 +175,6 @@ class DistributedClock:
         return 0 < (self._next_pulse - self._next_sync1) % TIMES < TIMES // 2
 
     def _world_time(self, system: int) -> int:
-        """Return the world time [ns] of a system time [ns]."""
         (offset,) = struct.unpack_from("<Q", self._memory, registers.TIME_OFFSET)
         local = (system - int(offset)) % TIMES
         # The anchor is recent: a pulse that has just passed lies before it.

@@ -105,7 +105,6 @@ class Mailbox:
 
     # --- inside -----------------------------------------------------------------------------------------------------
     def _next(self) -> bytes:
-        """Return the next answer with its header."""
         protocol, message, address = self._waiting.popleft()
         self._sent = self._sent % COUNTER + 1
         kind = protocol | self._sent << COUNTER_SHIFT

@@ -209,6 +209,5 @@ def entry_of(objects: dict[int, ObjectDescription], key: tuple[int, int]) -> tup
 
 
 def _mode(one: ClockMode, strings: _Strings) -> bytes:
-    """Return an operation mode of the clocks."""
     times = (one.cycle0, one.shift0, one.shift1, one.factor1, one.activation, one.factor0)
     return struct.pack("<IiihHhBB4s", *times, strings.number(one.name), strings.number(one.title), bytes(4))

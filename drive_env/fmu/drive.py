@@ -141,7 +141,6 @@ class FmuDrive(Saved):
 
     # --- inside ---------------------------------------------------------------------------------------------------
     def _present(self, one: FmuVariable) -> Any:
-        """Read the present value of a variable."""
         row, machine, axis = one.row, self.drives.machine, one.axes[0]
         number = axis // self.drives.load.num_axes
         if not isinstance(row.source, str):

@@ -72,7 +72,6 @@ def load_parameters(path: Path, dictionary: ObjectDictionary) -> dict[tuple[int,
 
 
 def _read_toml(path: Path) -> dict[str, Any]:
-    """Read a TOML file; ValueError if it is not TOML."""
     if not path.is_file():
         raise ValueError(f"there is no file {path}; write one with `drive-env parameters backup {path}`")
     try:

@@ -421,7 +421,6 @@ def _corner(R: float, L: float, psi_m: float, current: float, supply: float) -> 
 
 
 def _pull_out(row: Any, texts: Mapping[str, Any]) -> PullOut:
-    """Return a file's pull-out curve, checked."""
     keys = {"source", "supply_v", "speed_rpm", "torque_nm"}
     if not isinstance(row, Mapping) or set(row) != keys:
         raise MotorError(f"pull_out has {', '.join(sorted(keys))}, all of them")

@@ -163,7 +163,6 @@ class ImageObjects:
 
     # --- inside -----------------------------------------------------------------------------------------------------
     def _configure(self) -> None:
-        """Read the settings from the objects."""
         self._images = {direction: self._image(direction) for direction in ASSIGNMENTS}
 
     def _image(self, direction: int) -> MappedObjects | PackedFields:
@@ -200,7 +199,6 @@ class ImageObjects:
                 raise ObjectAccessError(VALUE_RANGE, f"{entry.label} cannot be {index:04X}h; there is {known}")
 
     def _can_carry(self, direction: int, index: int) -> bool:
-        """Return whether there is an image with that index for that direction."""
         fixed = self._fixed.get(index)
         return fixed.is_output == (direction == OUTPUTS) if fixed else self._mappings.get(index) == direction
 

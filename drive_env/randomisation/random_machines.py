@@ -555,5 +555,4 @@ def shares_of_chance(key: np.uint64 | NDArray[np.uint64], marks: NDArray[np.uint
 
 
 def _chance(key: np.uint64, name: str) -> float:
-    """Return the random number of one name."""
     return float(shares_of_chance(key, np.array([zlib.crc32(name.encode())], np.uint64))[0])

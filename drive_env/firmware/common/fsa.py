@@ -133,7 +133,6 @@ def _enter(drive, lane, number, end):
 
 @stage
 def _commands_operation(word):
-    """Return whether a controlword commands operation enabled."""
     return word & ENABLE_MASK == ENABLE_VALUE
 
 

@@ -70,7 +70,6 @@ def _follow_trapezoid(drive, lane, v_max, up, down, dt):
 
 @stage
 def _take_waiting(drive, lane):
-    """Take the set-point out of the buffer."""
     _take(drive, lane, drive.waiting_target[lane], drive.waiting_word[lane])
     empty_buffer(drive, lane)
 
