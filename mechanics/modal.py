@@ -39,7 +39,7 @@ class Corrections(NamedTuple):
     # Angle of an axis at the step's end, to add per displacement there in the leapfrog, and per speed [s].
     ends: Floats  # (C, A, D)
     ends_of_speed: Floats  # (C, A, D)
-    begin: Floats  # (C, D, D) displacement as the leapfrog has it, per displacement at rest
+    begin: Floats  # (C, D, D) displacement in the leapfrog's form, per displacement at rest
 
 
 def corrections(inertia: Floats, stiffness: Floats, damping: Floats, axes: Floats, h: float) -> Corrections:

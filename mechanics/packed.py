@@ -520,7 +520,7 @@ def _derive(loads: Sequence[PackedLoad], changed: NDArray[np.intp] | None = None
         plant.damping[:] = values.damping.T
     motion = first.plant.motion
     stiffness, damping = gathered("stiffness"), gathered("damping")
-    # Of each plant's array, what its copies get, copies last.
+    # Of each plant's array the copies' part, copies last.
     derived: dict[str, Floats] = {}
     if first.staggered:
         found = corrections(inertia, stiffness, damping, first.plant.axis_motion, first.h)

@@ -25,8 +25,8 @@ NEAREST = LOWERED[np.abs(np.log(LOWERED)).sum(axis=1).argsort(kind="stable")]
 class KeptMargins(NamedTuple):
     """The loops of identified machines with any gains.
 
-    models: Loops of each machine, and which axes it has. dynamics: What they must keep. calm: Gains for where no
-    lowered ones keep it, raw, (num_axes, count).
+    models: Loops of each machine, and its axes. dynamics: The required dynamics. calm: Gains to use if no lowered ones
+    keep them, raw, (num_axes, count).
     """
 
     models: list[tuple[LoopModel, Integers]]

@@ -83,9 +83,9 @@ class Normaliser(NamedTuple):
 class Memory(NamedTuple):
     """A network's memory of machines and their trials; heads come second.
 
-    shared: What every candidate's first layer gets alike, (machines, hidden). query: The context's part of queries,
+    shared: Equal input of every candidate's first layer, (machines, hidden). query: The context's part of queries,
     (machines, heads * KEY). gains: (machines, trials, gains). keys: (machines, heads, trials, KEY). values: (machines,
-    1, trials, value). hidden: What is no trial of the machine, (machines, 1, 1, trials).
+    1, trials, value). hidden: Entries without a trial, (machines, 1, 1, trials).
     """
 
     shared: Singles
@@ -144,8 +144,8 @@ class SurrogatePolicy:
     """Proposes gains for GainTuning, and answers: kind "surrogate" of a bundle.
 
     Arrays: those of NORMALISER, and those of WEIGHTS with the networks in the first dimension. Settings: gains (their
-    number), step (change of the log gains that an action of 1 makes), low, high (of what is tried, ln over the rule's,
-    for each gain), curiosity (of the scale, for trials), caution (of it, for the answer).
+    number), step (change of the log gains that an action of 1 makes), low, high (limits of trials, ln over the rule's,
+    for each gain), curiosity and caution (shares of the scale, for trials and for the answer).
     """
 
     def __init__(self, bundle: AgentFile) -> None:
@@ -193,8 +193,8 @@ class SurrogatePolicy:
     def answer(self, observation: ArrayLike) -> Floats:
         """Return the change of the log gains to the final choice, in steps: to a trial's gains, or the rule's.
 
-        All axes of an environment get the same trial: that whose worst axis is best, of those that were not stopped. It
-        is asked instead of `act`, with the observation after the last trial, and raises what that does.
+        All axes of an environment get the same trial: the one not stopped whose worst axis is best. Call it instead of
+        `act`, with the observation after the last trial; it raises the same errors.
         """
         _, incumbent = self._take(observation)
         median, scale = self._ask(self._read(), self._tried)

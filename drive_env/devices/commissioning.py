@@ -54,16 +54,15 @@ REVOLUTIONS = 2.0  # rev/s of moves, within the flat part of any row's torque
 RAMP = 10.0  # rev/s^2
 STOP = 100.0  # rev/s^2: a quick stop in csp and csv must stop 6,000 rpm within a second
 BOW = 0.05  # s of an S-shaped ramp (6086h = 1) to its acceleration
-# Blank time and off time of its chopper (TMC5160 class). In spread cycle a phase current ripples by no less than what
-# it rises by in the blank time, in which nothing is measured, and falls by in both slow decays of a cycle:
+# Blank time and off time of its chopper (TMC5160 class). In spread cycle the ripple of a phase current is at least its
+# rise in the blank time, in which nothing is measured, plus its fall in both slow decays of a cycle:
 #
 #     ripple = (u t_blank + 2 R i t_off) / L
 #
-# The factory's blank time of 36 clocks and off time of 172 suit windings of some millihenries. For one on which this is
-# more than `MOST_RIPPLE` of the run current, the two that the data sheet of the chip has besides are taken: a blank
-# time of 24 clocks ("1 or 2 for most applications", TBL) and the off time 3 of its first example of a CHOPCONF
-# (000100C3h). The chopper's frequency grows, and with it the losses of switching, which is why it is not done for every
-# motor.
+# The factory's blank time of 36 clocks and off time of 172 suit windings of some millihenries. If the ripple is more
+# than `MOST_RIPPLE` of the run current, the other values in the chip's data sheet are used: a blank time of 24 clocks
+# ("1 or 2 for most applications", TBL) and the off time 3 of its first example of a CHOPCONF (000100C3h). The chopper's
+# frequency grows, and with it the losses of switching, which is why it is not done for every motor.
 MOST_RIPPLE = 0.05  # of the run current
 CLOCK = 16e6  # Hz
 FACTORY_BLANK, FACTORY_OFF = 36.0, 12.0 + 32.0 * 5.0  # clocks: 2092h = 2, 2097h = 5

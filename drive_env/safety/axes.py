@@ -61,7 +61,7 @@ class Axes:
             [s].
         clock: Time in lockstep [s].
         velocity_object: The object that shows the speed: 606Ch, or 6044h of a drive of vl alone.
-        is_counted: Whether 606Ch counts what 6064h counts, per second.
+        is_counted: Whether the unit of 606Ch is that of 6064h per second.
     """
 
     def __init__(self, drives: WatchedDrives) -> None:

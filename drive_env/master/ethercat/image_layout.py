@@ -86,7 +86,7 @@ class ImagePlanner:
     def parsed(self, direction: int, pdos: Sequence[int], mapped: Sequence[int]) -> ImageLayout | None:
         """Return the image of a slave's mapping objects; None if it is not the same for every axis.
 
-        An image whose mapping object is read-only is ready-made, and taken as it is; so are several if one of them is.
+        An image with a read-only mapping object is ready-made, and stays unchanged; so do several if one of them is.
         """
         for layout in self._ready_made[direction]:
             if [layout.pdo] == list(pdos):
