@@ -1,8 +1,8 @@
 """Search for hyper-parameters with Optuna: every trial trains an agent and scores it on machines not used for training.
 
-The study is a journal file: it can be gone on with after an interruption, and by several processes at once. Trials are
-drawn in rounds, each from what the rounds before have found, so that those of a round may run side by side: where they
-run changes none of them.
+The study is a journal file: it can be continued after an interruption, and by several processes at once. Trials are
+drawn in rounds, each from the results of previous rounds, so that the trials of a round may run in parallel, with equal
+results anywhere.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ if TYPE_CHECKING:
     from tuning.runs.pools import Pool
 
 JOURNAL, BEST = "study.log", "best.yaml"
-ROUND = 5  # trials that are drawn from the same knowledge, and may run at a time
+ROUND = 5  # trials drawn from the same results, which may run in parallel
 
 
 class SearchRow(NamedTuple):
-    """A hyper-parameter that is searched: where it stands in the YAML, and its range or its choices."""
+    """A searched hyper-parameter: its place in the YAML, and its range or choices."""
 
     key: str
     low: float = 0.0
@@ -43,7 +43,7 @@ class SearchRow(NamedTuple):
     choices: tuple[Any, ...] = ()
 
 
-DISCOUNTS = (0.0, 0.95, 0.98, 0.99, 0.995, 1.0)  # 0: rewards that each step earns alone, as EachTrial's
+DISCOUNTS = (0.0, 0.95, 0.98, 0.99, 0.995, 1.0)  # 0: rewards that each step earns by itself, as in EachTrial's
 PPO = (
     SearchRow("learning_rate", 3e-5, 3e-3, log=True),
     SearchRow("gamma", choices=DISCOUNTS),
@@ -53,7 +53,7 @@ PPO = (
     SearchRow("policy_kwargs.log_std_init", -3.0, 0.0),
     SearchRow("policy_kwargs.net_arch", choices=("32,32", "64,64", "128,128")),
 )
-# Algorithm -> what is searched. Networks are texts: Optuna keeps choices in its file as JSON.
+# Algorithm -> searched hyper-parameters. Networks are texts: Optuna stores choices in its file as JSON.
 SPACES: dict[str, tuple[SearchRow, ...]] = {
     "ppo": PPO,
     "recurrent_ppo": (*PPO[:-1], SearchRow("policy_kwargs.lstm_hidden_size", choices=(32, 64, 128))),
@@ -70,18 +70,18 @@ SPACES["crossq"] = tuple(row for row in SPACES["sac"] if row.key not in NOT_TAKE
 
 
 class SearchTrial(NamedTuple):
-    """A trial that is over: its number, score (None if the training diverged), and the drawn hyper-parameters."""
+    """A finished trial: its number, score (None if the training diverged), and the drawn hyper-parameters."""
 
     number: int
     score: float | None
     drawn: Mapping[str, Any]
 
 
-Told = Callable[[SearchTrial, SearchTrial | None], None]  # a trial that is over, and the best one if there is one
+Told = Callable[[SearchTrial, SearchTrial | None], None]  # a finished trial, and the best one, if any
 
 
 class _TrainingTask(NamedTuple):
-    """A training and its score, for whatever process; without a folder its files come back with the score."""
+    """A training and its score, for any process; without a folder its files are returned with the score."""
 
     run: TrainingRun
     folder: Path | None
@@ -107,23 +107,23 @@ def search(
     told: Told | None = None,
     pool: Pool | None = None,
 ) -> dict[str, Any]:
-    """Try hyper-parameters and return the best, RL-Zoo's way; the folder gets the study, and best.yaml, trial by trial.
+    """Search hyper-parameters and return the best in RL-Zoo's form; study and best.yaml are updated after each trial.
 
-    A search that is killed loses the trials under way: the next search in the folder goes on behind them.
+    A killed search loses the trials under way; the next search in the folder continues after them.
 
     Args:
         environment: Name of the environment.
         algorithm: A row of SPACES.
-        hyperparameters: Those that a trial begins with.
-        folder: With a study in it, that is gone on with.
-        trials: How many more.
-        seed: Of trainings and of the search.
-        episodes: Of a score.
+        hyperparameters: Initial hyper-parameters of a trial.
+        folder: Folder of the study; an existing study is continued.
+        trials: Number of further trials.
+        seed: Seed of trainings and of the search.
+        episodes: Episodes for a score.
         told: Called with each completed trial, in their order, and the best one; None before there is one.
-        pool: Where else trials run, ROUND at a time, which changes none of them.
+        pool: Pool that runs trials elsewhere, ROUND at a time, with equal results.
 
     Raises:
-        DivergedError: If no training at all gave an agent.
+        DivergedError: If all trainings diverged.
         ValueError: For a study that was begun with other sources, hyper-parameters or files.
     """
     folder = Path(folder)
@@ -136,7 +136,7 @@ def search(
 
 
 def _make_round(study: _Study, count: int, pool: Pool | None) -> None:
-    """Make trials that are drawn from the same knowledge; those that an error or Ctrl-C ends have failed."""
+    """Make trials drawn from the same results; those ended by an error or Ctrl-C count as failed."""
     known = study.known()
     waiting: list[Any] = []
     try:
@@ -177,7 +177,7 @@ class _Study:
         self._states = optuna.trial.TrialState
 
     def known(self) -> Any:
-        """Return the finished trials as a study of its own."""
+        """Return the finished trials as a separate study."""
         import optuna
 
         known = optuna.create_study()
@@ -185,17 +185,17 @@ class _Study:
         return known
 
     def begin(self, known: Any, writes_there: bool) -> tuple[Any, _TrainingTask]:
-        """Return a trial, drawn from the trials known when its round began, and its task.
+        """Return a trial, drawn from the results known when its round began, and its task.
 
         Args:
-            known: As `known` returned it.
-            writes_there: Whether who does it writes into this folder.
+            known: Result of `known`.
+            writes_there: Whether the worker writes into this folder.
         """
         import optuna
 
         self._study.sampler = optuna.samplers.RandomSampler()  # draws nothing yet
         trial = self._study.ask()
-        # Seeded by trial: a search that is gone on with, or a second process, would draw the first ones again.
+        # Seeded by trial: a continued search, or a second process, would repeat the first draws.
         own = np.random.SeedSequence((self._seed, trial.number)).generate_state(1)[0]
         self._study.sampler = _sampler(known, int(own))
         base = self._base
@@ -203,11 +203,11 @@ class _Study:
         return trial, _TrainingTask(run, self._folder_of(trial) if writes_there else None, self._episodes)
 
     def end(self, trial: Any, scored: _Scored) -> None:
-        """Keep the result of a trial, and report it."""
+        """Store the result of a trial, and report it."""
         for name, content in scored.files.items():
             path = self._folder_of(trial) / name
             write_whole(path, content)
-        # A training that diverges is a trial that failed: the next ones go elsewhere.
+        # A diverged training is a failed trial: the next ones go elsewhere.
         state = self._states.FAIL if scored.score is None else self._states.COMPLETE
         found = self._study.tell(trial, scored.score, state=state)
         best = self._study.best_trial if self._completed() else None
@@ -219,7 +219,7 @@ class _Study:
             self._told(last, None if best is None else SearchTrial(best.number, best.value, best.params))
 
     def fail(self, trials: Sequence[Any]) -> None:
-        """Keep that trials did not come to their end."""
+        """Store trials as failed."""
         for trial in trials:
             self._study.tell(trial, state=self._states.FAIL, skip_if_finished=True)
 
@@ -243,18 +243,17 @@ class _Study:
 
 
 def _sampler(known: Any, seed: int) -> Any:
-    """Return Optuna's own sampler, which draws from the known trials in place of the study's present ones."""
+    """Return Optuna's own sampler, which draws from the known trials instead of the study's present ones."""
     from optuna.samplers import TPESampler
 
     class FromTheRoundsBefore(TPESampler):  # type: ignore[misc]  # Optuna has no types
         def sample_independent(self, _study: Any, trial: Any, name: str, distribution: Any) -> Any:
             return super().sample_independent(known, trial, name, distribution)
 
-    return FromTheRoundsBefore(seed=seed, multivariate=False)  # what is drawn jointly is so before the trial's seed
+    return FromTheRoundsBefore(seed=seed, multivariate=False)  # joint draws would come before the trial's seed
 
 
 def _trained(task: _TrainingTask) -> _Scored:
-    """Do a task."""
     from agents.evaluation.evaluation import evaluate
     from agents.policies.policy import policy_of
 
@@ -282,7 +281,7 @@ def _is_score(_: _TrainingTask, scored: Any) -> bool:
 
 
 def _in_turn(results: Iterator[tuple[int, _Scored]]) -> Iterator[_Scored]:
-    """Give results in the order of their tasks, each as soon as those before it are there."""
+    """Yield results in the order of their tasks, each as soon as all previous ones are available."""
     early: dict[int, _Scored] = {}
     given = 0
     for k, scored in results:
@@ -299,7 +298,7 @@ def _write(path: Path, environment: str, best: Mapping[str, Any], study: Any, tr
 
 
 def drawn(algorithm: str, hyperparameters: Mapping[str, Any], trial: Any) -> dict[str, Any]:
-    """Return hyper-parameters with a trial's values in their places."""
+    """Return hyper-parameters with a trial's values."""
     if algorithm not in SPACES:
         raise ValueError(f"there is no algorithm {algorithm!r}; there are {', '.join(ALGORITHMS)}")
     found: dict[str, Any] = copy.deepcopy(dict(hyperparameters))

@@ -1,4 +1,4 @@
-"""Values as JSON has them."""
+"""Values in the form of JSON."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 
 def plain(value: Any) -> Any:
-    """Return a value as JSON has it: arrays as lists, tuples as lists, infinities as text, mappings as tables."""
+    """Return a value in the form of JSON: arrays as lists, tuples as lists, infinities as text, mappings as tables."""
     if isinstance(value, Mapping):
         return {str(key): plain(one) for key, one in value.items()}
     if isinstance(value, (list, tuple)):

@@ -1,4 +1,4 @@
-"""The environments that agents are trained in, and how they are made."""
+"""The environments for training agents, and functions that make them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from drive_env.envs.vector_environment import VectorEnvironment
 
 
-OF_MACHINES = ("distributions", "privileged", "stage")  # options that only machines have that are drawn
+OF_MACHINES = ("distributions", "privileged", "stage")  # options only for drawn machines
 
 
 class TrainingTask(NamedTuple):
@@ -75,8 +75,8 @@ def make_environments(
         environment: Its name.
         num_envs: Number of environments.
         configuration: The environment's own options; a task of the suite takes none but its own.
-        options: drives, sensor, autoreset_mode, render_mode, as the environment takes them. Of a task on given drives,
-            which are what they are, no machines are drawn.
+        options: drives, sensor, autoreset_mode, render_mode, as for the environment. A task on given drives draws no
+            machines.
 
     Raises:
         ValueError: For an unknown name or an invalid value.
@@ -85,14 +85,14 @@ def make_environments(
     if name in SUITE and options.get("drives") is not None:
         name, own = environment_of(name), without_machines(name, own)
     if name in SUITE:
-        whole = _whole_configuration(name)  # an agent's file has all of it
+        whole = _whole_configuration(name)  # an agent's file contains all of it
         own = {key: value for key, value in own.items() if not _is_of_task(plain({key: value})[key], whole.get(key))}
         return make_vector(num_envs, name=name, **own, **options)
     return make_vector(num_envs, name=name, config=own, **options)
 
 
 def _is_of_task(value: Any, whole: Any) -> bool:
-    """Return whether an option is the task's; of weights those may lack that are newer than an agent's file, and 0."""
+    """Return whether an option equals the task's; weights of 0 may be missing, if newer than an agent's file."""
     if isinstance(value, Mapping) and isinstance(whole, Mapping):
         return value == {key: one for key, one in whole.items() if key in value or one}
     return bool(value == whole)
@@ -105,7 +105,7 @@ def without_machines(environment: str, configuration: Mapping[str, Any]) -> dict
 
 
 def _whole_configuration(task: str) -> dict[str, Any]:
-    """Return all options of a task of the suite for JSON, defaults too."""
+    """Return all options of a task of the suite for JSON, including defaults."""
     row = row_of(task)
     kind = getattr(importlib.import_module(f"drive_env.envs.{row.short}"), f"{row.kind}Config")
     table: dict[str, Any] = plain(asdict(kind(**SUITE[task].options)))
@@ -113,7 +113,7 @@ def _whole_configuration(task: str) -> dict[str, Any]:
 
 
 def configuration_of(lanes: Any) -> dict[str, Any]:
-    """Return all options of an environment for JSON, defaults too."""
+    """Return all options of an environment for JSON, including defaults."""
     table: dict[str, Any] = plain(asdict(lanes.config))
     return table
 

@@ -23,7 +23,7 @@ BRISTLE_DAMPING = 0.5
 
 
 class FrictionModel(NamedTuple):
-    """Which parts of a load's friction a model of friction takes; a fan's drag is its load and always there."""
+    """The parts of a load's friction that a model includes; a fan's drag is its load and always included."""
 
     name: str
     dry: bool
@@ -45,7 +45,7 @@ FRICTION_MODELS = {
 
 
 def find_friction(name: str) -> FrictionModel:
-    """Return a model of friction by name; ValueError lists the names there are."""
+    """Return a model of friction by name; ValueError lists the known names."""
     if name not in FRICTION_MODELS:
         raise ValueError(f"no friction is named {name!r}; there are {', '.join(FRICTION_MODELS)}")
     return FRICTION_MODELS[name]
@@ -53,7 +53,7 @@ def find_friction(name: str) -> FrictionModel:
 
 @inlined
 def middle_speed(v, other, J, h):
-    """Return the size of the mean speed that a step of h [s] would have without friction [rad/s]."""
+    """Return the absolute mean speed of a step of h [s] without friction [rad/s]."""
     return abs(v + 0.5 * h / J * other)
 
 
@@ -98,9 +98,8 @@ def bristle_torque(v, other, J, h, z, s_0, s_1, coulomb, breakaway, stribeck, vi
     """Return LuGre's friction torque [N*m] of one step, and the bristles' deflection [rad] at its end.
 
     The step's mean speed u solves u = v + h/2J (other + F(u)); at that speed the bristles relax towards z_ss
-    exponentially, which is taken exactly, so that neither stiff bristles nor high speeds are unstable. `s_0`
-    [N*m/rad] and `s_1` [N*m*s/rad] are the bristles' stiffness and damping; the others as `dry_friction` and
-    `limited_torque` have them.
+    exponentially, computed exactly, so that neither stiff bristles nor high speeds are unstable. `s_0` [N*m/rad] and
+    `s_1` [N*m*s/rad] are the bristles' stiffness and damping; the others are as in `dry_friction` and `limited_torque`.
     """
     half = 0.5 * h / J
     free = v + half * other
@@ -124,7 +123,7 @@ def bristle_torque(v, other, J, h, z, s_0, s_1, coulomb, breakaway, stribeck, vi
         mean = constant + slope * u
         end = decay * z + h * phi * u
         miss = u - free + half * mean
-        if miss == 0.0:  # at rest on relaxed bristles; to go on would be to look for rounding errors
+        if miss == 0.0:  # at rest on relaxed bristles; further iterations would only chase rounding errors
             break
         if miss > 0.0:
             high = u
@@ -132,7 +131,7 @@ def bristle_torque(v, other, J, h, z, s_0, s_1, coulomb, breakaway, stribeck, vi
             low = u
         following = (free - half * constant) / (1.0 + half * slope)
         if turn > 0 and miss != miss_before:
-            # x held creeps where friction all but stops the motion; the secant does not.
+            # x held creeps where friction almost stops the motion; the secant does not.
             secant = u - miss * (u - u_before) / (miss - miss_before)
             if low < secant < high:
                 following = secant

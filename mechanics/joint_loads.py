@@ -1,4 +1,4 @@
-"""What a drive on each joint of a model would turn: inertia, holding torque and friction, or why none can be there."""
+"""The load of a drive on each joint of a model: inertia, holding torque and friction, or why it cannot have a drive."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from mechanics.model import actuators_of, held_joints, read_any_model
 from mechanics.model_files import joints_without_travel
 from mechanics.reading.near_names import did_you_mean
 
-POSES = 512  # drawn, before the search from the best of them
+POSES = 512  # random poses before the search from the best of them
 VALUES = 25  # of one joint, on each line of the search
 ROUNDS = 2  # in which every joint is searched once
-SLIDE_SPAN = 1.0  # m to each side that a slide without a range is looked at
+SLIDE_SPAN = 1.0  # m to each side, searched for a slide without a range
 KINDS = {
     int(mujoco.mjtJoint.mjJNT_FREE): "free",
     int(mujoco.mjtJoint.mjJNT_BALL): "ball",
@@ -25,8 +25,8 @@ KINDS = {
     int(mujoco.mjtJoint.mjJNT_HINGE): "hinge",
 }
 _DRIVEN_KINDS = ("hinge", "slide")
-_NOTHING = 1e-12  # kg*m^2 or kg, and of an armature beside it the share that rounding takes
-_STILL = 1e-9  # of what a tendon's length changes with a joint
+_NOTHING = 1e-12  # kg*m^2 or kg; next to an armature, the share lost in rounding
+_STILL = 1e-9  # share of a tendon's change of length with a joint
 
 
 class Range(NamedTuple):
@@ -37,17 +37,17 @@ class Range(NamedTuple):
 
 
 class JointLoad(NamedTuple):
-    """What a drive on a joint turns while the other joints are held; of one without a drive nothing is known.
+    """The load of a drive on a joint while the other joints are held; unknown for a joint without a drive.
 
     Attributes:
-        name: Of the joint.
+        name: Name of the joint.
         kind: "hinge", "slide", "ball" or "free".
-        travel: Of the joint [rad or m]; infinite without limits.
-        inertia: At the joint, without its armature, which is the rotor's [kg*m^2 or kg].
+        travel: Travel of the joint [rad or m]; infinite without limits.
+        inertia: Inertia at the joint, without its armature, which belongs to the rotor [kg*m^2 or kg].
         holding: Torque or force that keeps it at rest: against gravity and springs [N*m or N].
-        friction: Dry [N*m or N].
-        damping: Viscous [N*m*s/rad or N*s/m].
-        refusal: Why no drive can be there, with the remedy; empty where one can.
+        friction: Dry friction [N*m or N].
+        damping: Viscous friction [N*m*s/rad or N*s/m].
+        refusal: Why it cannot have a drive, with the remedy; empty if it can.
     """
 
     name: str
@@ -71,14 +71,14 @@ class _Follower(NamedTuple):
 def joint_loads(load: Load, joints: Collection[str] = ()) -> list[JointLoad]:
     """Return inertia, torques and friction for a drive on each joint of a model, in the order of the file.
 
-    The extremes are searched for over the ranges of all joints, of a hinge without one over a turn.
+    The extremes are searched over the ranges of all joints; over one turn for a hinge without a range.
 
     Args:
-        load: Any model, also one with ball or free joints, which is no load.
-        joints: Joints to drive; by default those of the file's actuators, and all where it has none.
+        load: Any model, even one with ball or free joints.
+        joints: Joints to drive; by default those of the file's actuators, or all if it has no actuators.
 
     Raises:
-        ValueError: As `read_any_model`, or for a joint that is not there.
+        ValueError: As `read_any_model`, or for an unknown joint.
     """
     model = read_any_model(load)
     names = [str(model.joint(k).name) for k in range(model.njnt)]
@@ -140,7 +140,7 @@ def _refusals(
 
 
 def _tendon_driven(model: mujoco.MjModel) -> dict[str, str]:
-    """Return the joints that tendons with actuators move, each with its tendon in words."""
+    """Return the joints that tendons with actuators move, each with a text about its tendon."""
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     found = {}
@@ -155,7 +155,7 @@ def _tendon_driven(model: mujoco.MjModel) -> dict[str, str]:
 
 
 def _in_loops(model: mujoco.MjModel) -> dict[int, str]:
-    """Return the joints of bodies that an equality closes into a loop, each with that equality in words."""
+    """Return the joints of bodies that an equality closes into a loop, each with a text about it."""
     kinds = int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)
     found = {}
     for k in np.flatnonzero(np.isin(model.eq_type, kinds) & (model.eq_active0 != 0)):
@@ -175,7 +175,7 @@ def _in_loops(model: mujoco.MjModel) -> dict[int, str]:
 
 
 def _followers(model: mujoco.MjModel, asked: Collection[str]) -> dict[int, _Follower]:
-    """Return the joints that equalities move with others; of two, the one that is asked for leads where it can."""
+    """Return the joints that equalities move with others; of two, the requested one leads if possible."""
     found = {}
     for k in np.flatnonzero((model.eq_type == int(mujoco.mjtEq.mjEQ_JOINT)) & (model.eq_active0 != 0)):
         follower, leader = int(model.eq_obj1id[k]), int(model.eq_obj2id[k])
@@ -197,7 +197,7 @@ def _travel(model: mujoco.MjModel, joint: int) -> Range:
 
 
 def _limits(model: mujoco.MjModel) -> tuple[Floats, Floats]:
-    """Return how far each joint's position is looked at; ball and free joints stay where they are."""
+    """Return the searched range of each joint's position; ball and free joints stay at their position."""
     at = model.qpos0[model.jnt_qposadr]
     turns = np.array([KINDS[int(kind)] for kind in model.jnt_type])
     span = np.select([turns == "hinge", turns == "slide"], [np.pi, SLIDE_SPAN], 0.0)
@@ -210,7 +210,7 @@ def _statics(
     model: mujoco.MjModel, driven: list[int], followers: Mapping[int, _Follower]
 ) -> Callable[[Floats], Floats]:
     """Return the function from positions of the joints to inertias, then holding torques, of the driven ones."""
-    # Only inertia and the forces at rest are looked at.
+    # Only inertia and the forces at rest are needed.
     flags = mujoco.mjtDisableBit
     for flag in (flags.mjDSBL_CONTACT, flags.mjDSBL_EQUALITY, flags.mjDSBL_LIMIT, flags.mjDSBL_ACTUATION):
         model.opt.disableflags |= int(flag)

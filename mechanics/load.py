@@ -1,4 +1,4 @@
-"""What a driven load is, as data: which MJCF, which joints the drives turn, which numbers can be set and drawn."""
+"""A driven load as data: its MJCF, driven joints, and parameters that can be set and drawn."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ Combination = Mapping[str, float]
 
 
 class Parameter(NamedTuple):
-    """A number of the load that may be set per machine.
+    """A parameter of the load, set per machine.
 
-    `field` is where it lives, `element` in which one: a body's "body_mass", "body_inertia" or "body_ipos" (distance of
-    its centre of mass from its frame), a joint's "jnt_stiffness" or "dof_damping", all of the MJCF, which then holds
-    the default; or a column of one of the load's frictions, contacts or rolls. Low and high are the range of
-    randomisation, as multiples of the default.
+    `field` is its array, `element` the element: a body's "body_mass", "body_inertia" or "body_ipos" (distance of its
+    centre of mass from its frame), a joint's "jnt_stiffness" or "dof_damping", all in the MJCF, which then has the
+    default; or a column of one of the load's frictions, contacts or rolls. Low and high are the range of randomisation,
+    as multiples of the default.
     """
 
     name: str
@@ -61,10 +61,10 @@ class Switch(NamedTuple):
 
 
 class Contact(NamedTuple):
-    """A motion that is free from low to high [rad or m]; beyond, a spring and a damper push it back and never pull.
+    """A motion that is free from low to high [rad or m]; beyond, a spring and a damper push it back, but never pull.
 
-    Rubber end stops, or teeth and threads with backlash: low to high is then the gap, and the contact `transmits` what
-    the drive does to its load. stiffness [N*m/rad or N/m], damping [N*m*s/rad or N*s/m].
+    Rubber end stops, or teeth and threads with backlash: low to high is then the gap, and the contact `transmits` the
+    drive's force to its load. stiffness [N*m/rad or N/m], damping [N*m*s/rad or N*s/m].
     """
 
     name: str
@@ -79,8 +79,8 @@ class Contact(NamedTuple):
 class Roll(NamedTuple):
     """A web that a joint winds up: its radius grows with every turn, and the disturbance [N] pulls at the web.
 
-    start: Radius with which the run begins [m]; core: that of the empty core, whose inertia the MJCF's body has [m].
-    thickness: Of the web [m]. density: Mass per volume times width [kg/m^2].
+    start: Radius at the start [m]; core: radius of the empty core, whose inertia is in the MJCF [m]. thickness:
+    Thickness of the web [m]. density: Mass per volume times width [kg/m^2].
     """
 
     name: str
@@ -93,29 +93,29 @@ class Roll(NamedTuple):
 
 @dataclass(frozen=True)
 class Load:
-    """A driven load: a row of the table in loads.py, or your own machine.
+    """A driven load: a row of the table in loads.py, or the user's own machine.
 
     Attributes:
         mjcf: The MuJoCo model: the load's masses, without rotors. Hinge and slide joints only.
-        joints: The joints, or fixed tendons, that the drives turn, in the order of the axes. Of a model without an
-            answer here, its actuators' are taken, or its only joint.
-        gear: Rotor angle per unit of each axis's joint [1 or rad/m]: one for all or one each. Where the joints are the
-            actuators', theirs.
-        name: For messages; the file's by default.
-        disturbance: The motion on which the external load torque (force) acts; the first joint by default. A load
-            with a roll is pulled at its web instead.
-        frictions, contacts, rolls: What acts on the load beside MuJoCo.
-        parameters: What may be set per machine.
-        positions: The motion that presses each axis's switches, its joint where not given.
-        travel: How far each axis's position may go, low and high [rad or m]; None where it may turn for ever.
-        switches: Where the switches sit.
-        start: Positions of joints at the start [rad or m], 0 where not given.
-        meaning: One line on what it stands for.
-        disturbance_unit: Of the external load torque.
-        packing_bound: How far a packed copy may be from the load alone, as a share of the motion's range: 0 where no
-            constraint solver is involved, since it is then the same to the bit; 1e-9 within a second, filled in, where
-            the model has limits, contacts or loops.
-        energy_bound: How well energy is accounted for at the default step, as a share of the work done.
+        joints: The joints, or fixed tendons, that the drives turn, in the order of the axes. By default those of the
+            model's actuators, or its only joint.
+        gear: Rotor angle per unit of each axis's joint [1 or rad/m]: one for all or one each; by default the actuators'
+            gears.
+        name: Name for messages; by default the file's.
+        disturbance: The motion on which the external load torque (force) acts; the first joint by default. For a load
+            with a roll, the pull at its web.
+        frictions, contacts, rolls: Forces on the load that MuJoCo does not compute.
+        parameters: Parameters that may be set per machine.
+        positions: The motion that presses each axis's switches, by default its joint.
+        travel: Range of each axis's position, low and high [rad or m]; None if it may turn without limit.
+        switches: The switches.
+        start: Positions of joints at the start [rad or m], by default 0.
+        meaning: Description in one line.
+        disturbance_unit: Unit of the external load torque.
+        packing_bound: Largest deviation of a packed copy from the load alone, as a share of the motion's range: 0
+            without a constraint solver, since it is then equal bit by bit; 1e-9 within a second, filled in, if the
+            model has limits, contacts or loops.
+        energy_bound: Largest error of the energy balance at the default step, as a share of the work done.
     """
 
     mjcf: Path
@@ -137,7 +137,7 @@ class Load:
     energy_bound: float = 0.01
 
     def __post_init__(self) -> None:
-        """Take what a user may write more simply: one joint's name, a list, a path as text."""
+        """Accept simpler forms: one joint's name, a list, a path as text."""
         object.__setattr__(self, "mjcf", Path(self.mjcf))
         object.__setattr__(self, "joints", (self.joints,) if isinstance(self.joints, str) else tuple(self.joints))
         object.__setattr__(self, "name", self.name or self.mjcf.stem)
@@ -146,7 +146,7 @@ class Load:
 
     @property
     def num_axes(self) -> int:
-        """Number of drives that turn the load."""
+        """Number of drives of the load."""
         return len(self.joints)
 
     @property

@@ -1,4 +1,4 @@
-"""What each copy of a load has of its own: its numbers by the names of the load's parameters, and where each lives."""
+"""The values of each copy of a load: its parameters by name, and their places in arrays."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from mechanics.arrays import Floats, Integers, Mask
 from mechanics.load import Load, Parameter
 
-# Columns of the frictions, contacts and rolls as the rows give them.
+# Columns of the frictions, contacts and rolls in the order of the rows.
 FRICTION_COLUMNS = ("coulomb", "breakaway", "stribeck", "viscous", "drag", "bristle", "efficiency")
 CONTACT_COLUMNS = ("low", "high", "contact_stiffness", "contact_damping")
 ROLL_COLUMNS = ("start", "core", "thickness", "density")
@@ -19,10 +19,10 @@ _BODY_FIELDS = ("body_mass", "body_inertia", "body_ipos")
 
 
 class LoadValues:
-    """The numbers of copies of a load and of their rotors, which begin as the row and its MJCF have them.
+    """The values of copies of a load and of their rotors, initially those of the row and its MJCF.
 
-    A body's live in the packed model itself, all others in the arrays here. To store one moves nothing: `PackedLoad`
-    derives from them what is stepped.
+    A body's are in the packed model itself, all others in arrays here. Storing one has no effect on motion:
+    `PackedLoad` derives the stepped quantities from them.
 
     Args:
         load: The row, resolved (model.py).
@@ -30,15 +30,16 @@ class LoadValues:
         joints: Names of a copy's joints.
         bodies: Element of a parameter -> the number of every copy's body of that name (template.py).
         armature: Rotor inertia of each copy's axes [kg*m^2], shape (copies, axes).
-        motor_friction: Of each copy's axes, shape (copies, axes, 4): coulomb, breakaway, stribeck, viscous.
+        motor_friction: Friction of each copy's axes, shape (copies, axes, 4): coulomb, breakaway, stribeck, viscous.
 
     Attributes:
-        armature: As given, a copy of it.
-        friction: Of the axes' bearings, then of the load's rows, shape (copies, axes + rows, FRICTION_COLUMNS).
+        armature: A copy of the argument.
+        friction: Friction of the axes' bearings, then of the load's rows, shape (copies, axes + rows,
+            FRICTION_COLUMNS).
         contact: Shape (copies, contacts, CONTACT_COLUMNS).
         roll: Shape (copies, rolls, ROLL_COLUMNS).
-        stiffness: Of the joints' springs, shape (copies, D).
-        damping: Of the joints, shape (copies, D).
+        stiffness: Stiffness of the joints' springs, shape (copies, D).
+        damping: Damping of the joints, shape (copies, D).
     """
 
     def __init__(
@@ -70,7 +71,7 @@ class LoadValues:
 
     @property
     def motor_friction(self) -> Floats:
-        """The bearings' columns of `friction`, a view of the shape of the constructor's."""
+        """The bearings' columns of `friction`, a view in the shape of the constructor's argument."""
         return self.friction[:, : self._axes, :4]
 
     def get(self, name: str) -> Floats:
@@ -88,12 +89,12 @@ class LoadValues:
         return self._column(parameter, parameter.field).copy()
 
     def store(self, name: str, values: Floats, where: slice | Mask) -> None:
-        """Store a parameter of the copies chosen, one value each; ValueError leaves all as it was."""
+        """Store a parameter of the chosen copies, one value each; ValueError changes nothing."""
         self.check(name, values)
         self.store_checked(name, values, where)
 
     def store_checked(self, name: str, values: Floats, where: slice | Mask) -> None:
-        """Store what `check` has seen."""
+        """Store values already checked by `check`."""
         parameter = self._parameter(name)
         if parameter.field in _BODY_FIELDS:
             bodies = self._bodies[parameter.element][where]
@@ -112,7 +113,7 @@ class LoadValues:
             self._column(parameter, parameter.field)[where] = values
 
     def check(self, name: str, values: Floats) -> None:
-        """Raise ValueError unless every value is one that the parameter can have."""
+        """Raise ValueError unless every value is possible for the parameter."""
         parameter = self._parameter(name)
         label = f"{parameter.name} of load {self._load.name!r}"
         if np.any(values < 0.0) or not np.all(np.isfinite(values)):
@@ -131,11 +132,11 @@ class LoadValues:
         raise ValueError(f"load {self._load.name!r} has no parameter {name!r}; it has {names}")
 
     def _distances(self, bodies: Integers) -> Floats:
-        """Return how far bodies' centres of mass are from their frames [m]."""
+        """Return the distances of bodies' centres of mass from their frames [m]."""
         return np.sqrt([place @ place for place in self._model.body_ipos[bodies]])
 
     def _column(self, parameter: Parameter, field: str) -> Floats:
-        """Return the view, shape (copies,), in which a parameter lives that is not a body's."""
+        """Return the view, shape (copies,), of a parameter that is not a body's."""
         element = parameter.element
         if field in FRICTION_COLUMNS:
             row = self._axes + [f.name for f in self._load.frictions].index(element)
@@ -149,7 +150,7 @@ class LoadValues:
 
 
 def check_places(load: Load, model: mujoco.MjModel, joints: Sequence[str]) -> None:
-    """Raise ValueError, with the places that there are, if a parameter of a load lives nowhere.
+    """Raise ValueError, listing the known elements, if a parameter of a load names an unknown one.
 
     Args:
         load: The row, resolved.

@@ -58,7 +58,7 @@ def _guide(name: str, motion: Combination) -> Friction:
 
 
 def _screw(name: str, mass_range: tuple[float, float], meaning: str) -> Load:
-    """Return a ball-screw axis; horizontal and vertical ones differ in their MJCF alone."""
+    """Return a ball-screw axis; horizontal and vertical ones differ only in their MJCF."""
     return Load(
         MODELS / f"{name}.xml",
         joints=("screw",),
@@ -328,7 +328,7 @@ _ROWS = (
 
 MODEL_ENDINGS = (".xml", ".mjcf", ".urdf")  # of the path of your own model
 LOADS: dict[str, Load] = {row.name: row for row in _ROWS}
-# No load: for mechanics that are elsewhere and give the torque at the shaft.
+# No load: for mechanics outside this program, which gives the torque at the shaft.
 BARE_SHAFT = Load(
     MODELS / "bare_shaft.xml",
     joints=("shaft",),
@@ -341,10 +341,10 @@ BARE_SHAFT = Load(
 
 
 def find_load(load: str | Path | Load) -> Load:
-    """Return a load: a row by its name, or your own by the path of its MJCF or as a `Load`; its joints are found.
+    """Return a load: a row by its name, or the user's own by its MJCF or as a `Load`, with joints resolved.
 
     Raises:
-        ValueError: For an unknown name, listing those there are, or a model that does not fit.
+        ValueError: For an unknown name, listing the known ones, or a model that does not fit.
     """
     if isinstance(load, Load):
         return resolve(load)

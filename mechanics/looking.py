@@ -1,4 +1,4 @@
-"""Inertias and forces that follow the position: looked up at the start of a physics step."""
+"""Inertias and forces that depend on the position: computed at the start of a physics step."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from mechanics.kernels.compiled import stage
 
 @stage
 def wind(plant):
-    """Let what is wound up so far give each roll its inertia, and the web its lever.
+    """Set each roll's inertia and the web's lever arm by the wound length.
 
-    What arrives comes with the roll's surface speed and brings its own momentum, so that growing costs no torque.
+    Arriving web has the roll's surface speed and its own momentum, so that growth needs no torque.
     """
     D, copies = plant.damping.shape
     qpos, roll, roll_dof, roll_armature = plant.qpos, plant.roll, plant.roll_dof, plant.roll_armature
@@ -26,16 +26,16 @@ def wind(plant):
             radius = max(begun + thickness / (2.0 * math.pi) * qpos[k], core)
             wound = 0.5 * math.pi * roll[copy, r, 3] * (radius**4 - core**4)
             dof_armature[k] = roll_armature[copy, r] + wound
-            # What MuJoCo makes of it in the first half of its step.
+            # MuJoCo's results of the first half of its step.
             inertia[start[k] + count[k] - 1] = roll_inertia[copy, r] + wound
             disturbance[d, copy] = radius
 
 
 @stage
 def look(plant):
-    """Bring bias forces and inertias to the present position, by the first half of MuJoCo's step.
+    """Update bias forces and inertias to the present position by the first half of MuJoCo's step.
 
-    Centrifugal and Coriolis forces are taken at the step's middle, with the speed extrapolated to there.
+    Centrifugal and Coriolis forces are those at the step's middle, with the speed extrapolated.
     """
     D, copies = plant.damping.shape
     if plant.roll_dof.shape[0] > 0:
@@ -53,7 +53,7 @@ def look(plant):
         for d in range(D):
             for copy in range(copies):
                 k = copy * D + d
-                # The solver's force is that of the step before: it comes after those that are computed here.
+                # The solver's force is that of the previous step: it follows the forces that are computed here.
                 bias[d, copy] = found[k] - passive[k] - constraint[k]
         for k in range(copies * D):
             qvel[k] = qvel_before[k]
@@ -94,7 +94,7 @@ def decompose(plant):
 
 @stage
 def weigh(plant):
-    """Derive what each element's motion weighs from the copies' inertia matrices: M x = motion."""
+    """Derive the effective inertia of each element's motion from the copies' inertia matrices: M x = motion."""
     D, copies = plant.damping.shape
     L, share, mass, motion, kick = plant.triangle, plant.share, plant.mass, plant.motion, plant.axis_kick
     kicked = 0 if plant.elastic else plant.axis_motion.shape[0]

@@ -1,19 +1,19 @@
-"""What makes the staggered step exact for elastic loads: corrections of stiffness, damping and torque, mode by mode.
+"""Corrections of stiffness, damping and torque, mode by mode, that make the staggered step exact for elastic loads.
 
-The leapfrog takes a step's torque as an impulse in its middle. A mode of angular frequency w then oscillates at
-asin(w h / 2) / (h / 2), is excited by 1/cos(x), x = w h / 2, where torque that is held over the step excites it by
-sin(x)/x, and does not know when within the step the torque came. Written in the modes of M q'' + C q' + K q = f, with
-P' M P = 1 and K P = M P w^2, all of it are factors, and give matrices that the compiled step multiplies by.
+The leapfrog applies a step's torque as an impulse in its middle. A mode of angular frequency w then oscillates at
+asin(w h / 2) / (h / 2), is excited by 1/cos(x), x = w h / 2, while torque held over the step excites it by sin(x)/x,
+and ignores when within the step the torque acted. Written in the modes of M q'' + C q' + K q = f, with P' M P = 1 and K
+P = M P w^2, these are all factors, which give matrices for the compiled step.
 
 A mode q'' + 2 d q' + w^2 q = f has over one step an exact solution, (q, q')+ = E (q, q') + g f. The step, where MuJoCo
 takes the half b = d h of the damping at the step's end, is
 
     (1 + b) v+ = (1 - a) v - h k Q + h s f,    Q+ = Q + h v+.
 
-It is exact, v = q' at the step's end and Q = alpha q + beta q' in the middle of the next, with 1 - a = (1 + b) det E,
-k = (1 + b) det(1 - E) / h^2, s = (1 + b) g_2 / h, alpha = -h E_21 / det(1 - E) and beta = h - h (1 - E_11) /
-det(1 - E). Without damping k is (w sin(x)/x)^2, s sin(2x)/2x, alpha x/tan(x) and beta h/2. Where damping couples
-modes, each is corrected for its own: exact are dampers in proportion to the springs, as those of one shaft.
+It is exact, v = q' at the step's end and Q = alpha q + beta q' in the middle of the next, with 1 - a = (1 + b) det E, k
+= (1 + b) det(1 - E) / h^2, s = (1 + b) g_2 / h, alpha = -h E_21 / det(1 - E) and beta = h - h (1 - E_11) / det(1 - E).
+Without damping k is (w sin(x)/x)^2, s sin(2x)/2x, alpha x/tan(x) and beta h/2. If damping couples modes, each is
+corrected for its own damping: exact are dampers in proportion to the springs, as those of one shaft.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ class Corrections(NamedTuple):
     held: Floats  # (C, D, D) force to add per force held over the step
     held_moment: Floats  # (C, D, A) force to add per first moment of an axis's torque [1/s]
     kick: Floats  # (C, A, D) displacement per first moment, to be multiplied by h
-    # Angle of an axis at the step's end, to add per displacement there as the leapfrog has it, and per speed [s].
+    # Angle of an axis at the step's end, to add per displacement there in the leapfrog, and per speed [s].
     ends: Floats  # (C, A, D)
     ends_of_speed: Floats  # (C, A, D)
-    begin: Floats  # (C, D, D) displacement as the leapfrog has it, per displacement at rest
+    begin: Floats  # (C, D, D) displacement in the leapfrog's form, per displacement at rest
 
 
 def corrections(inertia: Floats, stiffness: Floats, damping: Floats, axes: Floats, h: float) -> Corrections:
@@ -76,10 +76,10 @@ def corrections(inertia: Floats, stiffness: Floats, damping: Floats, axes: Float
     beta = np.where(sprung, mode.beta, 0.5 * h)
     held = weighted @ ((end * mode.held - 1.0)[:, :, None] * through)
     moment = weighted @ ((end * mode.late_speed)[:, :, None] * driven)
-    # By what the leapfrog displaces less than torque that comes late does.
+    # The leapfrog's error of displacement for torque late in the step.
     kick = shapes @ ((alpha * mode.late + (h - beta) * mode.late_speed)[:, :, None] * driven)
     corrected = weighted @ ((end * mode.stiffness)[:, :, None] * into_modes)
-    # Rounding must not tie a rotor that is free to turn for ever to its angle at the start.
+    # Rounding must not tie a freely turning rotor to its angle at the start.
     corrected[np.abs(corrected) < 1e-12 * np.abs(corrected).max(axis=(1, 2), keepdims=True)] = 0.0
     begun = (1.0 - end * np.exp(-2.0 * d * h)) / h - d
     ends = axes @ shapes @ ((1.0 / alpha - 1.0)[:, :, None] * into_modes)

@@ -1,7 +1,7 @@
-"""From a load's MJCF to MuJoCo models: what it lacks is named, what it means is found, copies are put side by side.
+"""From a load's MJCF to MuJoCo models: checks it, resolves its joints, and packs copies into one model.
 
-MuJoCo compiles our own models here, and those of others in a process with limits (limited_child.py), which hands the
-compiled model back: a file of a line may ask for 10^9 bodies.
+MuJoCo compiles our own models here, and those of others in a process with limits (limited_child.py), which returns the
+compiled model: a one-line file may ask for 10^9 bodies.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ MODELS = Path(__file__).parent / "models"  # ours
 # Copies in one model. mj_step per copy: 1154 ns alone, 318 in 8, 204 in 64, 199 in 128 (two-mass shaft); a multiple of
 # 8, so that every group of machines but the last fills its drives' records.
 COPIES_PER_MODEL = 64
-# Of so many machines each thread has enough models that are larger, and fewer are made: a model and its data take
-# Python 1 ms and 600 kB, whatever is in them. From how many machines on, and how many copies.
+# From this number of machines on each thread has enough larger models, and fewer are made: a model and its data take
+# Python 1 ms and 600 kB, regardless of size. Number of machines, and number of copies.
 COPIES_OF_MANY = ((65_536, 256), (16_384, 128))
-# Copies that may touch things are told apart by MuJoCo's 32 contact bits.
+# Copies that may have contacts are separated by MuJoCo's 32 contact bits.
 CONTACT_BITS = 32
-# MuJoCo's solver works on all copies at once and stops by a tolerance of all: 4e-13 was seen in 0.6 s of motion.
+# MuJoCo's solver works on all copies at once and stops at a common tolerance: 4e-13 was measured in 0.6 s of motion.
 CONSTRAINED_PACKING_BOUND = 1e-9
-_MEMORY_PER_COPY = 2048  # bytes; 64 two-mass copies were seen to use 194 each
+_MEMORY_PER_COPY = 2048  # bytes; 64 two-mass copies were measured at 194 each
 _MEMORY_PER_CONSTRAINED_COPY = 400_000
 _MEMORY_FIXED = 65536
-_MOST_KEPT = 8  # models of others that are kept as they were compiled, each alone
+_MOST_KEPT = 8  # foreign models kept as compiled, each alone
 JOINT_TRANSMISSIONS = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
-_REMEDIES = {  # of what MuJoCo says
+_REMEDIES = {  # remedies for MuJoCo's messages
     "mjMINVAL": "give it an <inertial>, or geoms with a mass",
     "package:/": "MuJoCo knows no packages: write where the file lies from the folder of the model",
 }
@@ -54,10 +54,10 @@ def read_model(load: Load) -> mujoco.MjModel:
 
 
 def read_any_model(load: Load) -> mujoco.MjModel:
-    """Return the same whatever its joints are: one with others can be looked at, and is no load.
+    """Return a model with any joints; one with other joints than a load's can only be inspected.
 
     Raises:
-        ValueError: If there is no such file, it takes in files from elsewhere, it exceeds a limit, or MuJoCo cannot
+        ValueError: If there is no such file, it includes files from elsewhere, it exceeds a limit, or MuJoCo cannot
             read it.
     """
     if _is_ours(load.mjcf):
@@ -67,14 +67,14 @@ def read_any_model(load: Load) -> mujoco.MjModel:
     _kept[key] = kept = _compiled_elsewhere(load, None) if kept is None else kept
     while len(_kept) > _MOST_KEPT:
         _kept.popitem(last=False)
-    return copy.copy(kept)  # whoever asked may change it
+    return copy.copy(kept)  # the caller may change it
 
 
 def resolve(load: Load) -> Load:
     """Return the load with its joints found and everything it names checked against its model.
 
     Raises:
-        ValueError: With the joints and tendons that there are.
+        ValueError: With the existing joints and tendons.
     """
     model = read_model(load)
     joints = load.joints or tuple(actuators_of(model)) or (_joint_names(model) if model.njnt == 1 else ())
@@ -116,13 +116,13 @@ def resolve(load: Load) -> Load:
 
 
 def _gears(load: Load, model: mujoco.MjModel, joints: tuple[str, ...]) -> tuple[float, ...]:
-    """Return the gear of each axis; ValueError for one that turns nothing, with where it stands."""
+    """Return the gear of each axis; ValueError for one that turns nothing, with its place in the file."""
     if isinstance(load.gear, tuple) and len(load.gear) != len(joints):
         raise ValueError(f"load {load.name!r} has {len(joints)} driven joints and {len(load.gear)} gears")
     gears = load.gear if isinstance(load.gear, tuple) else (float(load.gear),) * len(joints)
     of_actuators = not load.joints and load.gear == 1.0
     if of_actuators:
-        # MuJoCo's gear of an actuator is what ours is: the rotor's angle per unit of its joint.
+        # MuJoCo's gear of an actuator equals ours: the rotor's angle per unit of its joint.
         gears = tuple(actuators_of(model).get(name, 1.0) for name in joints)
     for name, gear in zip(joints, gears, strict=True):
         if not np.isfinite(gear) or gear == 0.0:
@@ -135,7 +135,7 @@ def _gears(load: Load, model: mujoco.MjModel, joints: tuple[str, ...]) -> tuple[
 
 
 def _check_turnable(load: Load, model: mujoco.MjModel, name: str) -> None:
-    """Raise ValueError for a driven joint or tendon that does not follow its rotor, whatever that does."""
+    """Raise ValueError for a driven joint or tendon that cannot follow its rotor."""
     motion = _motion(model, name)
     if not motion:
         raise ValueError(
@@ -152,7 +152,7 @@ def _check_turnable(load: Load, model: mujoco.MjModel, name: str) -> None:
 
 
 def _without_zeros(load: Load, model: mujoco.MjModel, there: str) -> Load:
-    """Return the load with motions of joints that take part; ValueError for one of none, or of what is no joint."""
+    """Return the load without zero coefficients in motions; ValueError for a motion without or of unknown joints."""
 
     def moving(what: str, motion: Combination) -> Combination:
         for name, coefficient in motion.items():
@@ -184,7 +184,7 @@ def _without_zeros(load: Load, model: mujoco.MjModel, there: str) -> Load:
 
 
 def held_joints(model: mujoco.MjModel) -> dict[str, str]:
-    """Return the joints that an equality in force holds where they are, each with that equality in words."""
+    """Return the joints that an equality in force holds where they are, each with a text about it."""
     found = {}
     for k in np.flatnonzero((model.eq_type == int(mujoco.mjtEq.mjEQ_JOINT)) & (model.eq_active0 != 0)):
         terms = model.eq_data[k, :5]
@@ -196,7 +196,7 @@ def held_joints(model: mujoco.MjModel) -> dict[str, str]:
 
 
 def copies_per_model(load: Load, machines: int = 1) -> int:
-    """Return how many machines of a set one model holds; that of a load without constraints changes no digit."""
+    """Return how many machines of a set one model holds; without constraints results do not depend on it."""
     model = read_model(load)
     if not is_constrained(model):
         return next((copies for many, copies in COPIES_OF_MANY if machines >= many), COPIES_PER_MODEL)
@@ -214,9 +214,9 @@ def compile_packed(load: Load, copies: int) -> mujoco.MjModel:
 
 
 def with_motors(load: Load, gears: Mapping[str, float]) -> str:
-    """Return the text of an MJCF of a load's model that drives turn through gears, in place of its actuators.
+    """Return the text of an MJCF of a load's model with drives and gears instead of its actuators.
 
-    It takes in the files of the load's model where they are relative to that; files that are MJCF are in the text.
+    It refers to the model's other files by relative paths; included MJCF is in the text.
 
     Args:
         load: Any model.
@@ -235,7 +235,7 @@ def check_model(mjcf: Path) -> None:
     """Raise ValueError unless a model may be compiled in this process: it is ours, or was within the limits elsewhere.
 
     Raises:
-        ValueError: As `read_model`, whatever its joints are.
+        ValueError: As `read_model`, for any joints.
     """
     if not _is_ours(mjcf):
         key = "", _hash_of(mjcf)
@@ -252,11 +252,11 @@ def _packed(load: Load, copies: int) -> mujoco.MjModel:
     constrained = is_constrained(single)
     packed.memory = _MEMORY_FIXED + (_MEMORY_PER_CONSTRAINED_COPY if constrained else _MEMORY_PER_COPY) * copies
     packed.option = _spec(load).option
-    # What is only seen would be copied with each model and moved at each step. A fluid, though, acts on shapes.
+    # Visual shapes would be copied with each model and moved at each step. A fluid, though, acts on shapes.
     packed.compiler.discardvisual = not (single.opt.density or single.opt.viscosity)
     bits = _bits(single)
-    # An attachment takes as long as there is to attach to. Ten by ten, with the names' last digit first, 256 copies
-    # take half to a third of what they take one by one.
+    # Attaching takes as long as the number of elements. Ten by ten, with the names' last digit first, 256 copies take a
+    # third to half of the time of one by one.
     for tens in range(-(-copies // 10)):
         ten = mujoco.MjSpec() if tens else packed
         ten.option, ten.compiler.discardvisual = packed.option, packed.compiler.discardvisual
@@ -281,14 +281,14 @@ def is_constrained(model: mujoco.MjModel) -> bool:
 
 
 def is_varying(model: mujoco.MjModel) -> bool:
-    """Return whether inertia or gravity change with the position; found by looking at random positions."""
+    """Return whether inertia or gravity change with the position; tested at random positions."""
     return _changes(model, 1e-4, 0.0)
 
 
 def is_constant(model: mujoco.MjModel) -> bool:
-    """Return whether nothing at all changes but the force of the joints' own springs and dampers.
+    """Return whether only the forces of the joints' own springs and dampers change.
 
-    Found by looking at random positions and speeds.
+    Tested at random positions and speeds.
     """
     return not _changes(model, 1e-9, 1.0)
 
@@ -313,7 +313,7 @@ def motion_of(model: mujoco.MjModel, name: str, prefix: str = "") -> Combination
 
 # --- inside -----------------------------------------------------------------------------------------------------------
 def _changes(model: mujoco.MjModel, tolerance: float, speed: float) -> bool:
-    """Return whether inertias and forces change by more than a share; speeds of about `speed` [rad/s or m/s]."""
+    """Return whether inertias and forces change by more than the tolerance; speeds of about `speed` [rad/s or m/s]."""
     data = mujoco.MjData(model)
     generator = np.random.default_rng(0)
     seen = []
@@ -344,17 +344,17 @@ def _inertias(alone: mujoco.MjSpec, single: mujoco.MjModel) -> list[_Inertia]:
 
 
 def _must_be_told(alone: mujoco.MjSpec) -> bool:
-    """Return whether copies must be told their inertias, which they else find themselves, to the last digit.
+    """Return whether inertias must be written into copies instead of being computed from shapes.
 
-    What is only seen is left out of copies, and MuJoCo then writes its inertia down, but not where a file says that
-    inertia is that of shapes whatever else it says. The total of the masses that a file may ask for is not a copy's.
+    Visual shapes are left out of copies; MuJoCo keeps their inertia, except if a file demands inertia from shapes in
+    any case. A total mass that a file may demand is not that of a copy.
     """
     is_of_shapes = alone.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
     return bool(is_of_shapes or alone.compiler.settotalmass > 0.0)
 
 
 def _tell(spec: mujoco.MjSpec, inertias: list[_Inertia]) -> None:
-    """Write inertias down in a specification, so that they are no longer found from its shapes."""
+    """Write inertias into a specification, so that they are not computed from its shapes."""
     spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
     spec.compiler.settotalmass = -1.0
     for body, known in list(zip(spec.bodies, inertias, strict=True))[1:]:
@@ -364,7 +364,7 @@ def _tell(spec: mujoco.MjSpec, inertias: list[_Inertia]) -> None:
 
 
 def _copy(load: Load, shift: int, inertias: list[_Inertia]) -> mujoco.MjSpec:
-    """Return the specification of one copy, contact bits shifted; without `inertias` its shapes make them."""
+    """Return the specification of one copy, contact bits shifted; without `inertias` its shapes determine them."""
     child = _spec(load)
     if inertias:
         _tell(child, inertias)
@@ -373,7 +373,7 @@ def _copy(load: Load, shift: int, inertias: list[_Inertia]) -> mujoco.MjSpec:
     for key in list(child.keys):
         child.delete(key)
     for name in load.joints:
-        # The rotor enters later, in place of what the file may have.
+        # The rotor is added later, instead of an armature in the file.
         for joint in child.joints:
             if joint.name == name:
                 joint.armature = 0.0
@@ -381,7 +381,7 @@ def _copy(load: Load, shift: int, inertias: list[_Inertia]) -> mujoco.MjSpec:
             if tendon.name == name:
                 tendon.armature = 0.0
     for joint in child.joints:
-        joint.frictionloss = 0.0  # friction.py's, see _joint_friction
+        joint.frictionloss = 0.0  # replaced by friction.py's, see _joint_friction
     for geom in child.geoms:
         geom.contype = _signed(geom.contype << shift)
         geom.conaffinity = _signed(geom.conaffinity << shift)
@@ -389,7 +389,7 @@ def _copy(load: Load, shift: int, inertias: list[_Inertia]) -> mujoco.MjSpec:
 
 
 class _Inertia(NamedTuple):
-    """Of a body, as compiled: mass [kg], principal inertias [kg*m^2], where and how its frame of inertia lies [m]."""
+    """A compiled body's mass [kg], principal inertias [kg*m^2], position [m] and orientation of its inertial frame."""
 
     mass: float
     inertia: Floats
@@ -406,7 +406,7 @@ def _is_ours(mjcf: Path) -> bool:
 
 
 def _hash_of(mjcf: Path) -> str:
-    """Return the hash of a model's files; ValueError as `hash_of_model`, and if there is none."""
+    """Return the hash of a model's files; ValueError as `hash_of_model`, and if there is no file."""
     if not mjcf.exists():
         raise ValueError(f"there is no model file {str(mjcf)!r}")
     try:
@@ -423,7 +423,7 @@ def _compiled_elsewhere(load: Load, copies: int | None) -> mujoco.MjModel:
 
 def _compile_to_bytes(load: Load, copies: int | None) -> bytes:
     model = _compiled(load, _spec(load)) if copies is None else _packed(load, copies)
-    mujoco.MjData(model)  # a file may ask for memory here, too
+    mujoco.MjData(model)  # a file may demand memory here, too
     content = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, content)
     return content.tobytes()
@@ -432,7 +432,7 @@ def _compile_to_bytes(load: Load, copies: int | None) -> bytes:
 def _write_with_motors(load: Load, gears: Mapping[str, float]) -> bytes:
     spec = _spec(load)
     single = _with_driven_kinds(load, _compiled(load, spec))
-    # What a file says of finding inertias from shapes is not written; neither is that a shape does not count.
+    # A file's demand for inertia from shapes is not written, nor that a shape does not count.
     _tell(spec, _inertias(spec, single))
     for body in spec.bodies[1:]:
         for geom in body.geoms if not body.mass else ():
@@ -443,7 +443,7 @@ def _write_with_motors(load: Load, gears: Mapping[str, float]) -> bytes:
     for actuator in list(spec.actuators):
         spec.delete(actuator)
     for key in spec.keys:
-        key.ctrl = []  # of actuators that are no longer there
+        key.ctrl = []  # of actuators that no longer exist
     for joint, gear in gears.items():
         motor = spec.add_actuator(name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         motor.set_to_motor()
@@ -481,7 +481,7 @@ def _compiled(load: Load, spec: mujoco.MjSpec) -> mujoco.MjModel:
 
 
 def _with_driven_kinds(load: Load, model: mujoco.MjModel) -> mujoco.MjModel:
-    """Return the model; ValueError where it has joints that no drive turns and no copy can have, or none at all."""
+    """Return the model; ValueError if it has joints of other kinds than a load's, or no joints."""
     wrong = ~np.isin(model.jnt_type, (_SLIDE, _HINGE))
     if np.any(wrong):
         joints = [model.joint(int(k)) for k in np.flatnonzero(wrong)]
@@ -524,7 +524,7 @@ def _motion(model: mujoco.MjModel, name: str) -> Combination:
 
 
 def _joint_friction(model: mujoco.MjModel) -> tuple[Friction, ...]:
-    """Return the joints' friction losses as rows: dry friction is friction.py's, never the solver's as well."""
+    """Return the joints' friction losses as rows: dry friction is computed by friction.py, never also by the solver."""
     rows = []
     for k in range(model.njnt):
         loss = float(model.dof_frictionloss[model.jnt_dofadr[k]])
@@ -546,7 +546,7 @@ def _signed(bits: int) -> int:
 
 
 def _bits(model: mujoco.MjModel) -> int:
-    """Return how many contact bits the model uses."""
+    """Return the number of contact bits that the model uses."""
     used = int(np.bitwise_or.reduce(model.geom_contype | model.geom_conaffinity)) if model.ngeom else 0
     bits = used.bit_length()
     if bits > CONTACT_BITS // 8:

@@ -1,4 +1,4 @@
-"""Which files an MJCF takes in, found without MuJoCo: all must lie in its folder, and be files."""
+"""The files that an MJCF includes, found without MuJoCo: all must be regular files in its folder."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from pathlib import Path
 from mechanics.reading.untrusted import MOST_RECORDING, UntrustedFileError, read_bytes
 
 MOST_FILES = 1000  # of a model
-MOST_FOLDERS = 20  # that it names
-_TAKES_XML = ("include", "model")  # elements whose file is MJCF again
+MOST_FOLDERS = 20  # that it may name
+_TAKES_XML = ("include", "model")  # elements whose file is MJCF, too
 _FILES = ("file", "filename", *(f"file{side}" for side in ("right", "left", "up", "down", "front", "back")))
 _FOLDERS = ("meshdir", "texturedir", "assetdir")
-# As lenient as the reader of MuJoCo (tinyxml2), and once through the text whatever is in it.
+# As lenient as MuJoCo's reader (tinyxml2), and linear in the length of any text.
 _TAG = re.compile(
     r"""<!--.*?(?:-->|\Z)|<!\[CDATA\[.*?(?:\]\]>|\Z)|<\?.*?(?:\?>|\Z)"""
     r"""|<(?P<name>[^\s<>/"'=]*+)(?P<rest>(?:[^"'>]++|"[^"]*+(?:"|\Z)|'[^']*+(?:'|\Z))*+)""",
@@ -26,7 +26,7 @@ _ENTITIES = {"quot": '"', "amp": "&", "apos": "'", "lt": "<", "gt": ">"}
 
 
 def hash_of_model(mjcf: Path) -> str:
-    """Return a hash of all files that a model takes in, itself among them; errors as `files_of_model`."""
+    """Return a hash of a model's file and all files that it includes; errors as `files_of_model`."""
     digest = hashlib.sha256()
     for path in files_of_model(mjcf):
         content = read_bytes(path, MOST_RECORDING)
@@ -35,18 +35,18 @@ def hash_of_model(mjcf: Path) -> str:
 
 
 def files_of_model(mjcf: Path) -> list[Path]:
-    """Return all files that a model takes in, itself first.
+    """Return a model's file and all files that it includes.
 
     Raises:
         ValueError: If one is not in the model's folder, is not a regular file, or is too large; if there are too many,
-            or one that asks for a plug-in.
+            or one demands a plug-in.
         OSError: If the model itself cannot be read.
     """
     root = mjcf.parent.resolve()
     seen: dict[Path, None] = {}
     waiting = [mjcf]
     folders: dict[str, None] = {"": None}
-    named: dict[tuple[Path, str], bool] = {}  # whether it is MJCF again
+    named: dict[tuple[Path, str], bool] = {}  # whether it is MJCF, too
     while waiting:
         path = waiting.pop()
         if path in seen:
@@ -75,9 +75,9 @@ def files_of_model(mjcf: Path) -> list[Path]:
 
 
 def joints_without_travel(mjcf: Path) -> set[str]:
-    """Return the joints whose range in the file itself has no width, which MuJoCo takes as none given: it would turn.
+    """Return the joints whose range in the file has no width: MuJoCo would ignore it and let them turn.
 
-    Of an MJCF a joint's `range`, of a URDF the `limit` of a revolute or prismatic joint.
+    In an MJCF it is a joint's `range`, in a URDF the `limit` of a revolute or prismatic joint.
     """
     found: set[str] = set()
     joint: dict[str, str] = {}
@@ -97,7 +97,7 @@ def joints_without_travel(mjcf: Path) -> set[str]:
 
 
 def _attributes(text: str) -> Iterator[tuple[str, str, str]]:
-    """Give element, attribute and value, in the order of a text; MuJoCo looks for `include` without regard to case."""
+    """Give element, attribute and value, in the order of a text; MuJoCo ignores the case of `include`."""
     for tag in _TAG.finditer(text):
         if tag["name"] is None:
             continue
@@ -117,7 +117,7 @@ def _character(found: re.Match[str]) -> str:
 
 
 def _found(root: Path, mjcf: Path, bases: set[Path], folders: dict[str, None], name: str) -> list[Path]:
-    """Return every file that MuJoCo could mean by a name; it is in the model's folder, whichever it takes."""
+    """Return every file that MuJoCo could mean by a name; all are in the model's folder."""
     plain = name.replace("\\", "/")
     places = {
         base / folder.replace("\\", "/") / one
@@ -130,7 +130,7 @@ def _found(root: Path, mjcf: Path, bases: set[Path], folders: dict[str, None], n
         try:
             if "\0" in name or not place.exists() or place.is_dir():
                 continue
-        except OSError:  # a name that no file can have
+        except OSError:  # an impossible file name
             continue
         if not place.resolve().is_relative_to(root):
             raise UntrustedFileError(
@@ -138,7 +138,7 @@ def _found(root: Path, mjcf: Path, bases: set[Path], folders: dict[str, None], n
                 "elsewhere are not read; copy it into that folder, or move the model to a folder that holds both"
             )
         found.append(place)
-    # A URDF names what is only seen, too, which MuJoCo leaves out; what it lacks it tells.
+    # A URDF also names visual files, which MuJoCo leaves out; it reports missing ones.
     if not found and mjcf.suffix != ".urdf":
         raise UntrustedFileError(f"{mjcf} takes in {name!r}, and there is no such file in {root}")
     return found

@@ -1,7 +1,7 @@
 """Many independent copies of one load in one MuJoCo model.
 
-`mj_step` has a fixed price of about a microsecond, whatever the model; 64 copies in one model share it. Copies never
-touch, and without a constraint solver the result of a copy is bit for bit what it would be alone.
+`mj_step` has a fixed cost of about a microsecond for any model; 64 copies in one model share it. Copies never touch,
+and without a constraint solver a copy's result is bit by bit that of the load alone.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from mechanics.modal import Corrections, corrections
 from mechanics.plant import PackedPlant
 from mechanics.template import Template, template_of
 
-# Above this phase per step [rad] the discrete resonance cannot be put at the true one any more with good accuracy.
+# Above this phase per step [rad] the corrected resonance is not accurate.
 MAX_PHASE_PER_STEP = 0.7
-# Damping that couples resonances by more than this per step is off by more than 0.5 % of the peak speed.
+# Damping that couples resonances by more than this per step causes errors above 0.5 % of the peak speed.
 MAX_COUPLING_PER_STEP = 0.1
-# Machines whose numbers are derived together: their matrices stay in the processor's cache.
+# Machines that are derived together: their matrices stay in the processor's cache.
 COPIES_AT_ONCE = 2048
 _DISABLED = (
     mujoco.mjtDisableBit.mjDSBL_ACTUATION
@@ -48,20 +48,20 @@ class PackedLoad:
     Args:
         load: The row, resolved (model.py).
         armature: Rotor inertia of each copy's axes [kg*m^2], shape (copies, axes).
-        motor_friction: Of each copy's axes, shape (copies, axes, 4): coulomb, breakaway, stribeck, viscous.
+        motor_friction: Friction of each copy's axes, shape (copies, axes, 4): coulomb, breakaway, stribeck, viscous.
         parameters: Parameter name -> values, shape (copies,); others keep the row's default.
         h: Physics step [s].
         integrator: "leapfrog" (implicitfast, staggered) or "rk4", the slower oracle.
         friction: Model of the load's friction, a row of friction.py.
-        template: Of this load and as many copies, instead of one made anew.
+        template: Template of this load and number of copies; None: made anew.
         first_machine: Number of copy 0, for messages.
-        weigh_every: Steps after which the inertias that friction sees are brought to the present position.
-        ready: False neither checks the parameters nor derives anything from the numbers: `pack` does so of many
-            models at once.
+        weigh_every: Steps after which the inertias for friction are updated to the present position.
+        ready: Whether to check the parameters and derive the stepped quantities; `pack` does it for many models at
+            once.
 
     Attributes:
         joints: Names of a copy's joints, in the order of its degrees of freedom.
-        values: What each copy has of its own; `set`, `set_motor` and `set_all` change it and what is stepped.
+        values: Values of each copy; `set`, `set_motor` and `set_all` change them and the stepped quantities.
 
     Raises:
         ValueError: If a resonance is too fast for the step, or a parameter is unknown.
@@ -97,17 +97,17 @@ class PackedLoad:
         self.num_dofs = self.template.num_dofs
         self.joints = self.template.joints
         self.constrained = self.template.constrained
-        # Runge-Kutta looks at everything anew, too: it is the oracle.
+        # Runge-Kutta also recomputes everything: it is the oracle.
         self._looking = not self.staggered or self.constrained or self.template.varying
         self._constant = not self._looking and self.template.constant
-        # Rolls grow slowly and change nothing but their own inertia; where something else does, all is looked at.
+        # Rolls grow slowly and change only their own inertia; if anything else changes, all is recomputed.
         self._looking |= bool(load.rolls) and not self._constant
         self.varying = self._looking or bool(load.rolls)
         self.model.opt.integrator = _INTEGRATORS[integrator]
         self.model.opt.timestep = h
         self.model.opt.disableflags = int(_DISABLED | (0 if self.constrained else _DISABLED_UNCONSTRAINED))
         if load.rolls:
-            # MuJoCo takes the inertia of simple joints from a constant; a roll's grows.
+            # MuJoCo takes the inertia of simple joints from a constant, but a roll's grows.
             self.model.dof_simplenum[:] = 0
         self._rows = self.template.rows(self._model_of_friction)
         self.num_frictions = self._rows.num_frictions
@@ -134,7 +134,7 @@ class PackedLoad:
         return self.values.get(name)
 
     def set(self, name: str, values: Floats, where: Mask) -> None:
-        """Set a parameter of the copies where the mask is true; ValueError leaves all as it was."""
+        """Set a parameter of the copies where the mask is true; ValueError changes nothing."""
         before = self.get(name)
         self.values.store(name, np.asarray(values, float)[where], where)
         try:
@@ -147,7 +147,7 @@ class PackedLoad:
     def set_motor(self, armature: Floats, friction: Floats) -> None:
         """Set the rotors' inertia [kg*m^2] and bearing friction, in the shapes of the constructor.
 
-        ValueError leaves all as it was.
+        ValueError changes nothing.
         """
         _check_motors(armature, friction)
         before = self.values.armature.copy()
@@ -164,7 +164,7 @@ class PackedLoad:
     def set_all(self, parameters: Mapping[str, Floats], where: Mask, armature: Floats, friction: Floats) -> None:
         """Set parameters of the copies where the mask is true, and all motors as `set_motor` does, at once.
 
-        ValueError leaves all as it was.
+        ValueError changes nothing.
         """
         _check_motors(armature, friction)
         before = {name: self.get(name) for name in parameters}
@@ -183,7 +183,7 @@ class PackedLoad:
             raise
 
     def reset(self, where: Mask) -> None:
-        """Put the copies where the mask is true to rest at their start; a frozen one lives again."""
+        """Put the copies where the mask is true to rest at their start; a frozen one is released."""
         plant, data = self.plant, self.data
         self._by_copy(data.qpos)[where] = self.start
         if self._elastic:
@@ -195,8 +195,8 @@ class PackedLoad:
             values[where] = 0
 
     def set_step(self, h: float, weigh_every: int) -> None:
-        """Let physics steps be `h` [s] long from now on; arguments as of `__init__`. Motion goes on as it is."""
-        if self.staggered:  # positions stand in the middle of a step
+        """Set the length of physics steps to `h` [s]; arguments as for `__init__`. Motion continues."""
+        if self.staggered:  # positions are those in the middle of a step
             self.data.qpos[:] -= 0.5 * (h - self.h) * self.data.qvel
         self.h = self.model.opt.timestep = h
         self.plant.replace(weigh_every=weigh_every)
@@ -218,18 +218,18 @@ class PackedLoad:
         It acts on the friction of the load that is farthest from the rotor, or on the rotor where the load has none.
 
         Args:
-            torque: Of each axis [N*m], shape (copies, axes); 0 frees it.
+            torque: Torque for each axis [N*m], shape (copies, axes); 0 releases it.
         """
         plant = self.plant
         held = np.zeros_like(plant.brake)
         for axis, values in enumerate(torque.T):
             row, ratio = self._rows.jammed[axis]
-            held[row] = np.maximum(held[row], ratio * values)  # a part that two axes drive is held for both
+            held[row] = np.maximum(held[row], ratio * values)  # a part driven by two axes is held for both
         plant.jam[:] = held[: self.num_axes]
         plant.brake[self.num_axes :] = held[self.num_axes :]
 
     def mend(self, name: str, where: Mask) -> None:
-        """Bring the parts that a stiffness joins together again, at rest to each other where the rotor is.
+        """Rejoin the parts that a stiffness connects, at rest relative to each other, at the rotor's position.
 
         Args:
             name: Parameter that is the stiffness of a joint or of a contact.
@@ -264,9 +264,9 @@ class PackedLoad:
 
         Args:
             at: Time since now [s], or position of the first axis [rad or m]; increasing.
-            torque: On the load's disturbance [N*m or N].
+            torque: Torque on the load's disturbance [N*m or N].
             of_position: Whether `at` is a position.
-            period: After which the table begins anew; 0 holds the last value.
+            period: Period after which the table repeats; 0: the last value holds.
         """
         self.plant.clock[:] = 0.0
         self.plant.profile_now[:] = 0.0
@@ -278,7 +278,7 @@ class PackedLoad:
         )
 
     def save_state(self) -> dict[str, Any]:
-        """Return all that the copies go on from, position, speed and parameters, as dicts of arrays."""
+        """Return the complete state of the copies: position, speed and parameters, as dicts of arrays."""
         return {
             "model": {name: getattr(self.model, name).copy() for name in self.template.model_arrays},
             "mean_inertia": float(self.model.stat.meaninertia),
@@ -289,7 +289,7 @@ class PackedLoad:
         }
 
     def restore_state(self, state: Mapping[str, Any]) -> None:
-        """Bring copies of the same load to what `save_state` returned."""
+        """Restore copies of the same load to a result of `save_state`."""
         for own, saved in ((self.model, state["model"]), (self.data, state["data"]), (self.values, state["values"])):
             for name, values in saved.items():
                 getattr(own, name)[...] = values
@@ -306,9 +306,9 @@ class PackedLoad:
         return array.reshape(self.copies, self.num_dofs)
 
     def _stagger(self, where: Mask, *, back: bool = False) -> None:
-        """Bring positions at rest of the copies where the mask is true to what the leapfrog has for them, or back.
+        """Convert positions at rest of the copies where the mask is true to those of the leapfrog, or back.
 
-        It has a spring's displacement half a step later: without this, one that starts tense swings too far.
+        Its spring displacements are half a step later: without this, a spring that starts tense swings too far.
         """
         position, zero = self._by_copy(self.data.qpos), self.plant.spring_zero
         begin = self._begin[where]
@@ -390,14 +390,14 @@ class PackedLoad:
         )
 
     def _apply(self, changed: Mask | None = None) -> None:
-        """Bring the parameters of the changed copies into MuJoCo's model and the plant; None is all."""
+        """Write the parameters of the changed copies into MuJoCo's model and the plant; None: all copies."""
         if changed is None or np.any(changed):
             _derive([self], None if changed is None else np.flatnonzero(changed))
 
     def _weigh(self) -> Floats:
-        """Bring masses and rotors into MuJoCo's model; return each copy's inertia at the start, shape (copies, D, D).
+        """Write masses and rotors into MuJoCo's model; return each copy's inertia at the start, shape (copies, D, D).
 
-        At the start, so that setting one copy cannot change the rounding of another.
+        It is that at the start, so that setting one copy cannot change the rounding of another.
         """
         self._place_rotors()
         data = self.data
@@ -452,14 +452,14 @@ def pack(
     friction: str = "stribeck",
     weigh_every: int = 1,
 ) -> list[PackedLoad]:
-    """Return machines in packed models of `copies` each, the last of as many as are left.
+    """Return machines in packed models of `copies` each, the last one with the rest.
 
-    They are what `PackedLoad` would make of them one by one, in a third of the time.
+    The result equals single calls of `PackedLoad`, in a third of the time.
 
     Args:
         load: The row, resolved (model.py).
         armature: Rotor inertia of each machine's axes [kg*m^2], shape (machines, axes).
-        motor_friction: Of each machine's axes, shape (machines, axes, 4), as of `PackedLoad`.
+        motor_friction: Friction of each machine's axes, shape (machines, axes, 4), as in `PackedLoad`.
         parameters: Parameter name -> values, shape (machines,).
         h: Physics step [s].
         copies: Machines in a model.
@@ -495,11 +495,11 @@ def pack(
 
 
 def _derive(loads: Sequence[PackedLoad], changed: NDArray[np.intp] | None = None) -> None:
-    """Bring parameters into MuJoCo's models and the plants: stiffness corrected, damping halved, inertias derived.
+    """Write parameters into MuJoCo's models and the plants: stiffness corrected, damping halved, inertias derived.
 
     Args:
-        loads: Of the same row and with the same options.
-        changed: Copies of the only load there is for which what is derived outside MuJoCo is so; None is all.
+        loads: Loads of the same row with the same options.
+        changed: Copies of a single load for which the quantities outside MuJoCo are derived; None: all.
 
     Raises:
         ValueError: For a machine that cannot be stepped.
@@ -520,7 +520,7 @@ def _derive(loads: Sequence[PackedLoad], changed: NDArray[np.intp] | None = None
         plant.damping[:] = values.damping.T
     motion = first.plant.motion
     stiffness, damping = gathered("stiffness"), gathered("damping")
-    # Of each plant's array, what its copies get, copies last.
+    # Of each plant's array the copies' part, copies last.
     derived: dict[str, Floats] = {}
     if first.staggered:
         found = corrections(inertia, stiffness, damping, first.plant.axis_motion, first.h)
@@ -545,7 +545,7 @@ def _derive(loads: Sequence[PackedLoad], changed: NDArray[np.intp] | None = None
         plant, values = load.plant, load.values
         if first.staggered:
             load._begin[copies] = found.begin[part]
-        # The springs' force is the plant's, since the corrected one is no spring of a joint any more.
+        # The springs' force is in the plant, since the corrected one is not a spring of a joint.
         load._by_copy(load.model.jnt_stiffness)[:] = 0.0 if load.staggered else values.stiffness
         load._by_copy(load.model.dof_damping)[:] = values.damping * (0.5 if load.staggered else 1.0)
         for name, array in derived.items():
@@ -560,7 +560,7 @@ def _frictions(load: PackedLoad, own: Floats, mass: Floats) -> Floats:
     """Return the plant's rows of friction, shape (F, 8, n), of copies whose frictions are `own` on inertias `mass`."""
     chosen, rows_of = load._model_of_friction, load._rows
     column = {name: own[:, :, k] for k, name in enumerate(FRICTION_COLUMNS)}
-    # The motors' bearings keep theirs: it is theirs to be without friction.
+    # The motors' bearings are not changed: they may be without friction.
     loads = np.arange(own.shape[1]) >= load.num_axes
     coulomb = np.where(loads & (not chosen.dry), 0.0, column["coulomb"])
     risen = np.where(loads & (not chosen.stribeck), column["coulomb"], column["breakaway"])
@@ -569,7 +569,7 @@ def _frictions(load: PackedLoad, own: Floats, mass: Floats) -> Floats:
     losses = 1.0 / column["efficiency"] - 1.0
     rows = np.stack([coulomb, breakaway, column["stribeck"], viscous, column["drag"], losses], axis=-1)
     for k, (axis, scale) in rows_of.merged.items():
-        # A force F(v) on a motion that is `scale` of the rotor's is a torque of scale F(scale v) there.
+        # A force F(v) on a motion of `scale` times the rotor's is a torque of scale F(scale v) there.
         row, turning = rows[:, load.num_axes + k], rows[:, axis]
         powers = np.array([1.0, 1.0, 0.0, 2.0, 3.0, 1.0])
         turning += row * scale**powers * np.array([1.0, 1.0, 0.0, 1.0, 1.0, 1.0])
@@ -607,7 +607,7 @@ def _contacts(load: PackedLoad, own: Floats, mass: Floats, machines: NDArray[np.
 def _check_phase(load: PackedLoad, found: Corrections, stiffness: Floats, machines: NDArray[np.intp]) -> None:
     if 2.0 * found.phase.max() > MAX_PHASE_PER_STEP:
         worst, mode = np.unravel_index(int(found.phase.argmax()), found.phase.shape)
-        # The joint whose spring takes most of that mode's energy.
+        # The joint whose spring has most of that mode's energy.
         dof = int(np.argmax(stiffness[worst] * found.shapes[worst, :, mode] ** 2))
         _refuse(load, f"joint {load.joints[dof]!r}", int(machines[worst]), float(found.phase.max()))
 

@@ -1,4 +1,4 @@
-"""A load as its motors see it: how far they may turn, what they move, and the torque and inertia at their shafts."""
+"""A load as seen by its motors: their travel, the moved joints, and the torque and inertia at their shafts."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from mechanics.arrays import Floats, Mask
 from mechanics.load import Load
 from mechanics.packed import PackedLoad
 
-POSES = 16  # at which gravity and inertia are looked at, where they change
+POSES = 16  # at which changing gravity and inertia are computed
 
 
 class ShaftLoad(NamedTuple):
-    """Of every copy's axes, shape (copies, axes): the greatest over the poses looked at."""
+    """Torques and inertia of every copy's axes, shape (copies, axes): the maximum over some poses."""
 
     gravity: Floats  # torque against gravity [N*m]
     friction: Floats  # torque at break-away [N*m]
@@ -23,7 +23,7 @@ class ShaftLoad(NamedTuple):
 
 
 class Way(NamedTuple):
-    """What turning an axis's rotor alone does, passive joints at rest and backlash taken up."""
+    """Effect of turning only one axis's rotor, with passive joints at rest and backlash taken up."""
 
     joints: Floats  # (axes, D) speeds of the joints per speed of the rotor [1 or m/rad]
     position: Floats  # (axes,) speed of the axis's position per speed of the rotor [1 or m/rad]
@@ -33,12 +33,12 @@ class Way(NamedTuple):
 
 
 def one(load: Load) -> PackedLoad:
-    """Return the load alone, with rotors of no particular inertia: enough to ask for its ways."""
+    """Return the load alone, with rotors of no particular inertia: enough for `way`."""
     return PackedLoad(load, np.full((1, load.num_axes), 1e-3), np.zeros((1, load.num_axes, 4)), {}, 1e-6)
 
 
 def way(load: PackedLoad) -> Way:
-    """Return how far the axes may turn and what that moves."""
+    """Return the travel of the axes, and the motion of joints."""
     plant, row = load.plant, load.load
     coupled = [load.num_frictions + k for k, contact in enumerate(row.contacts) if contact.transmits]
     rows = np.concatenate([plant.axis_motion, plant.motion[coupled]])
@@ -66,11 +66,11 @@ def way(load: PackedLoad) -> Way:
 
 
 def shaft_load(load: PackedLoad, turning: Floats | None = None) -> ShaftLoad:
-    """Return what the shafts see when each axis turns alone, passive joints at rest and backlash taken up.
+    """Return torques and inertia at the shafts when each axis turns alone, passive joints at rest, backlash taken up.
 
     Args:
         load: The packed load.
-        turning: The joints' speeds of `way`, the same for every packed model of a load; looked up by default.
+        turning: The joints' speeds of `way`, the same for every packed model of a load; computed by default.
     """
     plant, turning = load.plant, way(load).joints if turning is None else turning
     frictions = plant.motion[: load.num_frictions]

@@ -1,9 +1,9 @@
 """One physics step of a packed model, called from compiled code.
 
-Time is staggered (leapfrog): qvel stands at step ends, qpos at step middles. MuJoCo's semi-implicit step then is the
-leapfrog scheme, of second order, at the price of one force evaluation. Damping is kept second-order by giving half of
-it to MuJoCo, which takes it at the step's end, and half to the applied force, at the step's start. Springs and their
-dampers are exact by modal.py's corrections.
+Time is staggered (leapfrog): qvel is that at step ends, qpos that at step middles. MuJoCo's semi-implicit step then is
+the leapfrog scheme, of second order, at the price of one force evaluation. Damping is of second order because MuJoCo
+applies half of it at the step's end, and the applied force contains the other half, at the step's start. Springs and
+their dampers are exact by modal.py's corrections.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from mechanics.kernels import native
 from mechanics.kernels.compiled import inlined, stage
 from mechanics.looking import look
 
-# Speed that rounding leaves of a motion that friction holds, as a share of what the break-away torque could give.
+# Speed of a motion held by friction that is rounding error, as a share of the effect of the break-away torque.
 ROUNDING = 1e-9
 
-# Beyond this speed [rad/s or m/s] a machine has left physics: 1e5 rad/s is a million rpm.
+# Beyond this speed [rad/s or m/s] a machine has diverged: 1e5 rad/s is a million rpm.
 SPEED_LIMIT = 1e5
 
 
-# The loop over copies is the innermost one, and does little: LLVM vectorises it while it has to tell no more than eight
-# pairs of arrays apart. With copies outside, the glue around MuJoCo's step took up to twice as long, most for six
-# axes. What is 0 for all copies is left out before the loop.
+# The loop over copies is innermost and does little: LLVM vectorises it as long as it must distinguish at most eight
+# pairs of arrays. With copies outside, the code around MuJoCo's step took up to twice as long, most for six axes. Terms
+# that are 0 for all copies are left out before the loop.
 @stage
 def add_product(total, i, factor, rows, k):
     """Add `factor` times row k to row i of a total."""
@@ -48,7 +48,7 @@ def see_motion(lane, v, other, motion, share, e, speed, total):
 
 @stage
 def see_axis(lane, turned, axis_motion, a, share, e):
-    """Write into row `turned` of `lane` what motion e has of a torque of axis a."""
+    """Write into row `turned` of `lane` the effect of a torque of axis a on motion e."""
     D, copies = axis_motion.shape[1], lane.shape[1]
     for copy in range(copies):
         lane[turned, copy] = 0.0
@@ -61,7 +61,7 @@ def see_axis(lane, turned, axis_motion, a, share, e):
 
 @stage
 def gather(rows, array):
-    """Bring one of MuJoCo's arrays, (C D,), into rows of copies, (D, C)."""
+    """Copy one of MuJoCo's arrays, (C D,), into rows of copies, (D, C)."""
     D, copies = rows.shape
     for d in range(D):
         for copy in range(copies):
@@ -70,7 +70,7 @@ def gather(rows, array):
 
 @stage
 def scatter(rows, array):
-    """Bring rows of copies, (D, C), into one of MuJoCo's arrays, (C D,)."""
+    """Copy rows of copies, (D, C), into one of MuJoCo's arrays, (C D,)."""
     D, copies = rows.shape
     for d in range(D):
         for copy in range(copies):
@@ -81,7 +81,7 @@ def scatter(rows, array):
 def drive(plant, torque, moment, h):
     """Begin `applied`: motor torque (C A,), load torque, springs, half of the damping, over one step of h [s].
 
-    `total` becomes all force on each degree of freedom, what MuJoCo adds included.
+    `total` becomes the whole force on each degree of freedom, including MuJoCo's.
     """
     D, copies = plant.damping.shape
     axis_motion, disturbance, load_torque = plant.axis_motion, plant.disturbance, plant.load_torque
@@ -132,13 +132,13 @@ def drive(plant, torque, moment, h):
     given = 0.0 if plant.looking else half
     ahead = plant.ahead
     for d in range(D):
-        # MuJoCo's half was taken at the speed ahead in `look`.
+        # MuJoCo's half was computed at the speed ahead in `look`.
         for copy in range(copies):
             applied[d, copy] -= half * damping[d, copy] * (speed[d, copy] - ahead[copy * D + d])
         for copy in range(copies):
             total[d, copy] = applied[d, copy] - bias[d, copy] - given * damping[d, copy] * speed[d, copy]
     if plant.constant:
-        # The half that the first half of MuJoCo's step would have computed.
+        # The part that the first half of MuJoCo's step would have computed.
         passive = plant.qfrc_passive
         for d in range(D):
             for copy in range(copies):
@@ -147,7 +147,7 @@ def drive(plant, torque, moment, h):
 
 @stage
 def follow_profile(plant, h):
-    """Look up what the table of torque says for the middle of this step, interpolated."""
+    """Interpolate the table of torque at the middle of this step."""
     D, copies = plant.damping.shape
     at, profile = plant.profile_at, plant.profile
     for copy in range(copies):
@@ -204,7 +204,7 @@ def press(plant, moment, h):
                 lane[correction, copy] += contact[b, 5, copy] * lane[turned, copy] * moment[copy * A + a]
         for copy in range(copies):
             spring, damping = contact[b, 2, copy] * lane[pressed, copy], contact[b, 3, copy]
-            # The damper at the speed of the step's middle, which it slows itself: stable for any damping.
+            # The damper at the step's mean speed, which it reduces itself: stable for any damping.
             half = 0.5 * h / mass[e, copy]
             middle = lane[v, copy] + half * (lane[other, copy] + lane[correction, copy] + spring)
             lane[force, copy] = spring - damping * middle / (1.0 + half * damping)
@@ -214,7 +214,7 @@ def press(plant, moment, h):
             lane[correction, copy] = lane[correction, copy] if pushes else 0.0
         for copy in range(copies):
             lane[force, copy] += lane[correction, copy]
-        # With the correction it is what the contact really transmits, mean over the step.
+        # With the correction it is the transmitted force, mean over the step.
         for copy in range(copies):
             carried[copy, b] = lane[force, copy]
         for d in range(D):
@@ -224,7 +224,7 @@ def press(plant, moment, h):
 
 @stage
 def rub(plant, h):
-    """Add friction, one motion after the other: each sees all other forces, of later frictions those a step ago."""
+    """Add friction motion by motion: each depends on all other forces, for later frictions on the previous step's."""
     D, copies = plant.damping.shape
     friction, brake, carries, carried = plant.friction, plant.brake, plant.carries, plant.carried
     speed, applied, total, diverged = plant.speed, plant.applied, plant.total, plant.diverged
@@ -243,9 +243,9 @@ def rub(plant, h):
         see_motion(lane, v, other, motion, share, f, speed, total)
         for copy in range(copies):
             if not abs(h * lane[other, copy]) < SPEED_LIMIT * mass[f, copy]:
-                # Seen before MuJoCo sees it: its own check would write a log file.
+                # Checked before MuJoCo's own check, which would write a log file.
                 diverged[copy] = 1
-        # What holds beside the row's own: a brake, or a screw that is pressed.
+        # Holding torque besides the row's own: a brake, or a screw under force.
         for copy in range(copies):
             lane[limit, copy] = brake[f, copy]
         if carries[f] >= 0:
@@ -284,7 +284,7 @@ def rub(plant, h):
 
 @stage
 def freeze(plant):
-    """Hold diverged copies at rest, so that they disturb no other and cost no numbers."""
+    """Hold diverged copies at rest, so that they do not disturb others or overflow."""
     D, copies = plant.damping.shape
     diverged = plant.diverged
     found = 0
@@ -309,7 +309,7 @@ def freeze(plant):
 
 @stage
 def report(plant, torque, moment, h, theta, omega, reaction, position):
-    """Write what the axes see at the step's end, and let MuJoCo's positions know when within the step torque came."""
+    """Write the axes' values at the step's end; correct MuJoCo's positions for when within the step torque acted."""
     D, copies = plant.damping.shape
     place, before, speed, lane, diverged = plant.position, plant.speed, plant.reached, plant.lane, plant.diverged
     axis_motion, axis_position, axis_start = plant.axis_motion, plant.axis_position, plant.axis_start
@@ -338,7 +338,7 @@ def report(plant, torque, moment, h, theta, omega, reaction, position):
             for d in range(D):
                 for copy in range(copies):
                     place[d, copy] -= kick[a, d, copy] * lane[0, copy]
-    # From the step's middle back to its end: what has no spring moves evenly since its impulse in the middle.
+    # From the step's middle to its end: motions without a spring are uniform after their impulse in the middle.
     back = 0.5 * h if plant.staggered else 0.0
     rate = 1.0 / h
     # Rows of `lane`.
@@ -385,7 +385,7 @@ def report(plant, torque, moment, h, theta, omega, reaction, position):
 
 @stage
 def report_contacts(plant, back, theta):
-    """Bring the axes' angles at the step's end to where the springs of contacts have them, as `ends` does of joints."""
+    """Correct the axes' angles at the step's end for the springs of contacts, as `ends` does for joints."""
     D, copies = plant.damping.shape
     place, speed, lane, contact = plant.position, plant.reached, plant.lane, plant.contact
     axis_motion, motion, share, carried = plant.axis_motion, plant.motion, plant.share, plant.carried
@@ -407,7 +407,7 @@ def report_contacts(plant, back, theta):
         for copy in range(copies):
             low, high = contact[b, 0, copy], contact[b, 1, copy]
             deep = max(low - lane[x, copy], 0.0) + min(high - lane[x, copy], 0.0)
-            # By this copy's own force: what other copies touch must change nothing here.
+            # By this copy's own force: contacts of other copies must not change anything here.
             lane[pressed, copy] = deep if carried[copy, b] != 0.0 else 0.0
         for a in range(A):
             see_axis(lane, turned, axis_motion, a, share, e)

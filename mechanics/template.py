@@ -1,4 +1,4 @@
-"""What all packed models of a load with equally many copies have in common: compiled, looked at and looked up once."""
+"""The common part of all packed models of a load with the same number of copies, compiled and analysed once."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ _MOST_TEMPLATES = 32  # one of 64 copies takes about 6 MB
 
 
 class Rows(NamedTuple):
-    """What acts on the motions of a load under a model of friction, as the plant's rows have it; D joints.
+    """Frictions, contacts and forces on a load's motions, in the order of the plant's rows; D joints.
 
-    merged: Friction of the load that is computed in one with a bearing's -> axis, its motion per the rotor's.
-    apart: Frictions that have a row, in `LoadValues`' count: the axes' bearings, and those that are not merged.
+    merged: Friction of the load computed together with a bearing's -> axis, its motion per the rotor's. apart:
+    Frictions with a row, in the numbering of `LoadValues`: the axes' bearings, and those that are not merged.
     num_frictions: Their number.
-    motion: Of these frictions and of the contacts, from the joints, shape (num_frictions + contacts, D).
-    position: Of what presses each axis's switches, shape (axes, D).
+    motion: Motions of these frictions and of the contacts, from the joints, shape (num_frictions + contacts, D).
+    position: Positions that press each axis's switches, shape (axes, D).
     disturbance: Shape (D,).
-    carries: Contact whose force each friction grows with, or -1, shape (num_frictions,).
-    jammed: For each axis, which friction holds its load, and its torque or force per rotor torque.
+    carries: Contact whose force increases each friction, or -1, shape (num_frictions,).
+    jammed: For each axis, the friction that holds its load, and its torque or force per rotor torque.
     """
 
     merged: dict[int, tuple[int, float]]
@@ -47,24 +47,23 @@ class Rows(NamedTuple):
 
 
 class Template:
-    """A load's packed model before any machine has numbers of its own; thousands of them are made of one template.
+    """A load's packed model before machines have their own values; thousands of machines use one template.
 
     Args:
         load: The row, resolved (model.py).
         copies: Copies of the load in the model.
 
     Attributes:
-        model: MuJoCo's, to be copied and never changed.
-        scratch: Data of it, each thread's own, in which poses of any copy of the model are looked at.
+        model: MuJoCo's model, to be copied and never changed.
+        scratch: Its data for computations in any pose, one per thread.
         joints: Names of a copy's joints, in the order of its degrees of freedom.
         turning: Rotor angle of each axis from joints.
-        position: What presses each axis's switches, from joints.
+        position: Position that presses each axis's switches, from joints.
         bodies: Element of a parameter -> the number of every copy's body of that name, shape (copies,).
-        tendons: The same of the tendons that drives turn.
-        constrained, varying, constant: What model.py finds of the load.
+        tendons: The same for the driven tendons. constrained, varying, constant: Properties found by model.py.
 
     Raises:
-        ValueError: If a parameter of the row lives nowhere.
+        ValueError: If a parameter of the row names an unknown element.
     """
 
     def __init__(self, load: Load, copies: int) -> None:
@@ -97,7 +96,7 @@ class Template:
 
     @cached_property
     def model_arrays(self) -> tuple[str, ...]:
-        """Arrays of a copy of the model that a load's parameters change, or MuJoCo derives from what they change."""
+        """Arrays of a copy of the model that a load's parameters change, or that MuJoCo derives from these."""
         return tuple(
             name
             for name in dir(self.model)
@@ -109,14 +108,14 @@ class Template:
 
     @cached_property
     def data_arrays(self) -> tuple[str, ...]:
-        """Arrays of a model's data that a step leaves for the next: not those that it makes as long as it needs."""
+        """Arrays of a model's data that persist from step to step, without temporary ones."""
         data = mujoco.MjData(self.model)
         arrays = {name: getattr(data, name) for name in dir(data) if not name.startswith("_")}
         return tuple(name for name, array in arrays.items() if isinstance(array, np.ndarray) and array.size)
 
     @property
     def scratch(self) -> mujoco.MjData:
-        """Data of the model, each thread's own."""
+        """Data of the model, one per thread."""
         if not hasattr(self._scratch, "data"):
             self._scratch.data = mujoco.MjData(self.model)
         return self._scratch.data
@@ -130,9 +129,9 @@ class Template:
         return found
 
     def weigh(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
-        """Bring what a step without constraints takes from masses up to date in a copy of the model, as MuJoCo does.
+        """Update quantities that a step without constraints derives from masses in a copy of the model, as MuJoCo does.
 
-        `mujoco.mj_setConst` derives besides what its constraint solver takes, in a time that grows with the square of
+        `mujoco.mj_setConst` also derives quantities for its constraint solver, in a time that grows with the square of
         the copies: 0.7 ms for 64 shafts of two masses, where this takes 0.1.
 
         Args:
@@ -146,11 +145,11 @@ class Template:
         parents = model.body_parentid[1 : 1 + bodies]
         for body in reversed(np.flatnonzero(parents).tolist()):
             of_copies[:, parents[body] - 1] += of_copies[:, body]
-        # One after the other from the last to the first: another order has another rounding.
+        # In order from the last to the first: another order rounds differently.
         roots = of_copies[::-1, np.flatnonzero(parents == 0)[::-1]]
         subtrees[0] = np.cumsum(np.append(subtrees[0], roots))[-1]
         if np.any(model.dof_simplenum):
-            # The inertias of joints that are simple are not computed but taken from dof_M0.
+            # The inertias of simple joints are not computed but taken from dof_M0.
             simple = model.dof_simplenum.copy()
             model.dof_simplenum[:] = 0
             data.qpos[:] = model.qpos0
@@ -166,7 +165,7 @@ class Template:
 
     def _rows_with(self, bristles: bool) -> Rows:
         load, axes = self._load, len(self.turning)
-        # The bearings' friction acts on the rotors' motions. Friction on a rotor's own motion is computed in one with
+        # The bearings' friction acts on the rotors' motions. Friction on a rotor's own motion is computed together with
         # its bearing's, unless it has bristles.
         merged = {} if bristles else _proportional(self.turning, load.frictions)
         apart = [*range(axes), *(axes + k for k in range(len(load.frictions)) if k not in merged)]
@@ -202,7 +201,7 @@ class Template:
     def _jammed(self, motions: Sequence[Combination], apart: Sequence[int]) -> list[tuple[int, float]]:
         found = []
         for axis in range(len(self.turning)):
-            # What moves with the rotor: joints of its own motion, and those that a contact drives from them.
+            # Motions of the rotor: its own joints, and those that a contact drives from them.
             per_rotor = {name: 1.0 / c for name, c in motions[axis].items()}
             for contact in self._load.contacts:
                 if len(contact.motion) > 1 and any(name in per_rotor for name in contact.motion):
@@ -232,9 +231,9 @@ class Template:
 
 
 def template_of(load: Load, copies: int) -> Template:
-    """Return a load's template, one of the last that were made where the row and its file are as they were then.
+    """Return a load's template, a cached one if the row and its file are unchanged.
 
-    A model that takes in other files is read anew each time.
+    A model that includes other files is read anew each time.
 
     Raises:
         ValueError: As `Template`.

@@ -21,7 +21,7 @@ from mechanics.reading.untrusted import read_rows as read_rows_of
 
 TEXT, NUMBERS, CURVES = "results.md", "results.json", "learning_curves.png"
 EXPERT, ALL = "expert", "all tasks"
-POINTS = 100  # of a curve
+POINTS = 100  # points of a curve
 
 
 @dataclass(frozen=True)
@@ -31,14 +31,14 @@ class Standing:
     Attributes:
         task: Name of the task, or ALL.
         policy: Its name.
-        kind: As the rows have it.
-        seeds: Of trainings.
+        kind: As in the rows.
+        seeds: Number of trainings.
         score: Interquartile mean over seeds and episodes.
-        mean: Of all scores: what the middle half hides, rare failures, is in it.
+        mean: Mean of all scores, which includes rare failures outside the middle half.
         improvement: Probability that it is better than the expert in an episode; None for the expert.
         ended_early: Share of the episodes that a fall or a trip ended.
-        steps: Of a training.
-        cpu_minutes: Of a training, mean over the seeds.
+        steps: Steps of a training.
+        cpu_minutes: CPU minutes of a training, mean over the seeds.
     """
 
     task: str
@@ -57,8 +57,8 @@ def read_rows(folder: Path) -> dict[str, dict[str, list[Row]]]:
     """Return a folder's rows of each task and policy, by seed.
 
     Raises:
-        RowError: For a file that is no row, or was changed.
-        ValueError: If rows of a task are not of the same episodes.
+        RowError: For a file that is not a row, or was changed.
+        ValueError: If rows of a task are from different episodes.
     """
     found: dict[str, dict[str, list[Row]]] = {}
     for path in sorted(folder.glob(f"*/*/*/{RESULT}")):
@@ -74,7 +74,7 @@ def read_rows(folder: Path) -> dict[str, dict[str, list[Row]]]:
 
 
 def standings(rows: Mapping[str, Mapping[str, Sequence[Row]]]) -> list[Standing]:
-    """Return the table: the policies of each task, the best first, and those that did every one of several tasks."""
+    """Return the table: the policies of each task, best first, and those with results in all of several tasks."""
     table: list[Standing] = []
     for task, policies in rows.items():
         own = [_standing(task, {task: policies}, policy) for policy in policies]
@@ -160,7 +160,6 @@ def _short(task: str) -> str:
 
 
 def _curves(policies: Mapping[str, Sequence[Row]]) -> list[str]:
-    """Return the policies that have a curve."""
     return [policy for policy, rows in policies.items() if rows[0].kind == TRAINED]
 
 

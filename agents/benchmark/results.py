@@ -1,7 +1,7 @@
 """The result of a run of the benchmark, `<task>/<policy>/<seed>/result.json`: a row that can be checked.
 
-Its digest is over all else in it. That shows a file that was torn or changed; anybody can make a new digest, so it says
-nothing of who made the row. What proves the scores is to run the episodes again (`check`).
+Its digest covers all other content, and reveals a truncated or changed file; since anyone can compute a digest, it does
+not prove the row's origin. Only running the episodes again (`check`) proves the scores.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ TRAINED, SUBMITTED, BASELINE = "trained", "submitted", "baseline"
 
 
 class RowError(ValueError):
-    """A file is no row of the benchmark, or was changed; the message says which."""
+    """A file is not a row of the benchmark, or was changed; the message says which."""
 
 
 @dataclass(frozen=True)
@@ -33,16 +33,16 @@ class Row:
         task: Name of the task.
         policy: Name of the algorithm, of the baseline, or of the submitted policy.
         kind: TRAINED, SUBMITTED or BASELINE.
-        seed: Of the training; 0 for a row that was not trained here.
-        opened: What names the policy for `open_policy`: a file beside the row, a Python function or a baseline.
-        policy_sha256: Of that file, or of the function's; "" for a baseline, which is in the package's sources.
-        seeds: Of the first and of the last episode.
-        scores: Of the episodes: the sum of rewards over the horizon, 0...1.
+        seed: Seed of the training; 0 for a row that was not trained here.
+        opened: The policy's name for `open_policy`: a file beside the row, a Python function or a baseline.
+        policy_sha256: Hash of that file, or of the function's; "" for a baseline, which is in the package's sources.
+        seeds: Seeds of the first and of the last episode.
+        scores: Scores of the episodes: the sum of rewards over the horizon, 0...1.
         ended_early: Episodes that a fall or a trip ended.
-        steps: Of the training, all environments together.
-        hyperparameters: Of the training.
-        cpu_seconds: Of the training, and of the episodes.
-        versions: What made it.
+        steps: Steps of the training, all environments together.
+        hyperparameters: Hyper-parameters of the training.
+        cpu_seconds: CPU time of the training, and of the episodes.
+        versions: Versions of the packages used.
     """
 
     task: str
@@ -77,7 +77,7 @@ class Row:
             row = cls(**table)
             sound = len(row.scores) == row.seeds[1] - row.seeds[0] + 1 > 0
             sound = sound and row.task in TASKS and row.seeds[0] in TEST and row.seeds[1] in TEST
-            # Names of files beside it, never a path that leads elsewhere.
+            # Names of files beside it, never a path elsewhere.
             sound = sound and all(name == Path(name).name for name in (row.opened, row.policy))
             sound = sound and all(isinstance(score, float) for score in row.scores)
         except OSError as error:

@@ -1,7 +1,6 @@
 """The runs of the benchmark: an agent is trained, or a policy opened, and judged in the held-out episodes of its task.
 
-Every run has a folder with its `result.json`, written last: what an interruption leaves is begun anew, and what is
-complete stays.
+Every run has a folder with its `result.json`, written last: an interrupted run is repeated, a complete one stays.
 """
 
 from __future__ import annotations
@@ -32,22 +31,22 @@ from tuning.runs.provenance import check_begun, versions
 if TYPE_CHECKING:
     from tuning.runs.pools import Pool
 
-EPISODES = 64  # of a task, held out
-ONE_THREAD = {"num_threads": 1}  # so that CPU time is what a run costs, and runs side by side do not disturb each other
+EPISODES = 64  # held-out episodes of a task
+ONE_THREAD = {"num_threads": 1}  # CPU time is then the cost of a run, and parallel runs do not disturb each other
 
 
 @dataclass(frozen=True)
 class BenchmarkRun:
-    """A policy that is judged on a task.
+    """A policy evaluated on a task.
 
     Attributes:
         task: Name of the task.
         policy: Name of the algorithm, of the baseline, or of the submitted policy.
         kind: TRAINED, SUBMITTED or BASELINE.
-        seed: Of the training.
-        hyperparameters: Of the training.
-        written: What is opened where nothing is trained.
-        episodes: Held-out ones.
+        seed: Seed of the training.
+        hyperparameters: Hyper-parameters of the training.
+        written: The policy to open if it is not trained.
+        episodes: Number of held-out episodes.
     """
 
     task: str
@@ -60,11 +59,11 @@ class BenchmarkRun:
 
     @property
     def folder(self) -> str:
-        """Its folder in that of the benchmark."""
+        """Its folder in the benchmark's folder."""
         return f"{self.task.partition('/')[2]}/{self.policy}/{self.seed}"
 
     def check_same(self, path: Path, row: Row) -> None:
-        """Raise ValueError unless a row that is there already is this run's."""
+        """Raise ValueError unless an existing row belongs to this run."""
         check_begun(path, row.versions.get("sources"), "give another --out")
         what = {
             "hyper-parameters": (row.hyperparameters, dict(self.hyperparameters)),
@@ -84,7 +83,7 @@ class _Done(NamedTuple):
 
 
 def suite_task(text: str) -> str:
-    """Return a task's full name from any spelling; ValueError for none of the suite."""
+    """Return a task's full name from any spelling; ValueError for a task outside the suite."""
     name = environment_name(text)
     if name not in TASKS:
         raise ValueError(f"{name} is no task of the suite, whose configuration is frozen; take {', '.join(TASKS)}")
@@ -97,12 +96,12 @@ def baseline_runs(task: str) -> list[BenchmarkRun]:
 
 
 def submitted_run(task: str, text: str, trust: bool) -> BenchmarkRun:
-    """Return the run of a policy that its author submits.
+    """Return the run of a submitted policy.
 
     Args:
         task: Name of the task.
-        text: What names the policy: a file or module:function.
-        trust: As `open_policy` takes it.
+        text: Name of the policy: a file or module:function.
+        trust: As for `open_policy`.
 
     Raises:
         ValueError: For a baseline, which every table has, or the name of an algorithm.
@@ -123,17 +122,17 @@ def make(
     told: Callable[[BenchmarkRun, Row], None] = lambda run, row: None,
     share: Callable[[float], None] = lambda share: None,
 ) -> None:
-    """Make the runs that the folder does not hold yet.
+    """Make the runs that are missing in the folder.
 
     Args:
         runs: All runs.
-        folder: Of the benchmark.
-        pool: Where else they are made, which changes none of them.
-        told: Called with each that is made.
-        share: Called with the share of all runs that is done.
+        folder: Folder of the benchmark.
+        pool: Pool that makes them elsewhere, with equal results.
+        told: Called with each finished run.
+        share: Called with the finished share of all runs.
 
     Raises:
-        ValueError: For a row that is there and is of another run, or of other sources.
+        ValueError: For an existing row of another run, or of other sources.
     """
     left = []
     for run in runs:
@@ -167,7 +166,7 @@ def _each(
 
 
 def _made(run: BenchmarkRun, tell: Callable[[float], None] = lambda share: None) -> _Done:
-    """Train a row's agent, and judge it."""
+    """Train a row's agent, and evaluate it."""
     from agents.policies.policy import policy_of
 
     files: dict[str, bytes] = {}

@@ -2,8 +2,8 @@
 
 After Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice", NeurIPS 2021
 (arXiv:2108.13264). A task is a stratum: its seeds and its episodes are drawn anew with replacement. All seeds are
-judged in the same episodes: one that is drawn twice counts twice for every seed, and for the rival. The draws are the
-same every time. With a single seed an interval says nothing of how another training would end.
+judged in the same episodes: one that is drawn twice counts twice for every seed, and for the rival. The draws are
+reproducible. With a single seed an interval does not cover the variation between trainings.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ def interquartile_mean(tables: Sequence[Floats]) -> ScoreEstimate:
 
 
 def probability_of_improvement(tables: Sequence[Floats], rivals: Sequence[Floats]) -> ScoreEstimate:
-    """Return how probable it is that a score is above the rival's in the same episode; an equal one counts half.
+    """Return the probability that a score is above the rival's in the same episode; an equal one counts half.
 
     Args:
         tables: Scores of each task, shape (seeds, episodes).
-        rivals: The rival's, shape (episodes,) each.
+        rivals: The rival's scores, shape (episodes,) each.
     """
     wins = [np.heaviside(table - rival, 0.5) for table, rival in zip(tables, rivals, strict=True)]
     return _estimate(lambda rows: rows.mean(axis=1), wins)

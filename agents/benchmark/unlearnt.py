@@ -1,4 +1,4 @@
-"""Policies that have learnt nothing: a task of the suite that one of them wins would be none."""
+"""Policies without learning: a task that one of them solves would not be suitable for the suite."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ PAIRS = ((4.0, 0.5), (6.0, 0.5), (8.0, 1.0), (16.0, 1.0), (16.0, 0.1), (32.0, 0.
 CONSTANTS = (-1.0, -0.5, -0.2, -0.05, 0.05, 0.1, 0.2, 0.5, 1.0)
 # Velocity P, velocity I and position P: the best of 141 constant sets of the payload tasks, and others near it.
 SETS = ((-0.575, -1.0, 0.05), (-0.41, -0.83, 0.06), (-0.49, -0.78, 0.17), (-0.45, -0.66, -0.07), (-0.25, -0.9, 0.0))
-SPEEDS = (0.3, 0.35, 0.4, 0.43, 0.46, 0.5, 0.55, 0.6)  # of the one that a run asks for
-CORNERS = (-2.0 / 3.0, 0.0, 2.0 / 3.0)  # of a tuning's actions, of which each entry is a gain of its own
+SPEEDS = (0.3, 0.35, 0.4, 0.43, 0.46, 0.5, 0.55, 0.6)  # of the demanded speed
+CORNERS = (-2.0 / 3.0, 0.0, 2.0 / 3.0)  # of a tuning's actions, in which each entry is a separate gain
 
-# Action of every entry from the errors of position and speed, shape (machines, entries), and a generator. In a tuning
-# these errors do not exist: position is +1 and -1 in turn.
+# Action of every entry from the errors of position and speed, shape (machines, entries), and a generator. A tuning has
+# no such errors: the position error is +1 and -1 alternately.
 Plain = Callable[[Floats, Floats, np.random.Generator], Floats]
 
 
@@ -30,7 +30,7 @@ def _constant(*values: float) -> Plain:
 
 
 def _steady(speed: float) -> Plain:
-    """Return the policy that goes to a speed, of the one that is asked for all the time, and keeps it."""
+    """Return the policy that goes to a share of the demanded speed, and keeps it."""
     return lambda error, slow, rng: np.clip(5.0 * (slow - 1.0 + speed), -1.0, 1.0)
 
 
@@ -56,7 +56,7 @@ POLICIES: dict[str, dict[str, Plain]] = {
         if any(corner)
     },
 }
-# Likewise, of a task beside those of its environment: of a stepper a speed is what one commands.
+# The same for a task, in addition to those of its environment: on a stepper the speed is commanded.
 OWN_POLICIES: dict[str, dict[str, Plain]] = {
     "ServoDrive/StepperRun-v1": {f"speed {share:g}": _steady(share) for share in SPEEDS}
 }
@@ -72,7 +72,7 @@ def unlearnt_scores(name: str, machines: int) -> dict[str, float]:
     lanes = make_vector(len(policies) * machines, name=name, autoreset_mode="NextStep")
     try:
         entries = lanes.single_action_space.shape[0]  # type: ignore[index]
-        seen, _ = lanes.reset(seed=list(range(machines)) * len(policies))  # every policy meets the same ones
+        seen, _ = lanes.reset(seed=list(range(machines)) * len(policies))  # every policy gets the same machines
         rng = np.random.default_rng(0)
         total, going = np.zeros(lanes.num_envs), np.ones(lanes.num_envs, bool)
         for step in range(TASKS[name].steps):
@@ -90,9 +90,9 @@ def unlearnt_scores(name: str, machines: int) -> dict[str, float]:
 
 
 def _errors(name: str, seen: Any, entries: int, step: int) -> Floats:
-    """Return the errors of position and speed that go with each entry of the action, (2, environments, entries)."""
+    """Return the errors of position and speed for each entry of the action, (2, environments, entries)."""
     environment = environment_of(name)
-    if environment == "ServoDrive/GainTuning-v0":  # a trial has none: by turns
+    if environment == "ServoDrive/GainTuning-v0":  # a trial has no such errors: alternately
         count = len(next(iter(seen.values()))) if isinstance(seen, dict) else len(seen)
         return np.stack([np.full((count, entries), (-1.0) ** step), np.zeros((count, entries))])
     rows = np.asarray(seen, float)

@@ -94,7 +94,6 @@ def benchmark(
 def _trainings(
     tasks: list[str] | None, algorithms: list[str], seeds: int, steps: int | None, trust: bool
 ) -> list[BenchmarkRun]:
-    """Return the runs of baselines and trainings."""
     from agents.benchmark.results import TRAINED
     from agents.benchmark.runs import BenchmarkRun, baseline_runs, suite_task
     from agents.training import hyperparameters
@@ -141,7 +140,7 @@ def _check(context: typer.Context, path: Path, trust: bool) -> None:
 
 
 def _check_alone(context: typer.Context, name: str, others: tuple[str, ...]) -> None:
-    """Raise ValueError for options that another one leaves nothing to do."""
+    """Raise ValueError for options that have no effect with another one."""
     given = [one for one in given_options(context) if one in others]
     if given:
         raise ValueError(f"{name} takes no {', '.join(given)}; leave it out")

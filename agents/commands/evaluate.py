@@ -45,7 +45,7 @@ logger = logging.getLogger(__name__)
 
 EMULATOR = "emulator"
 BUS_EPISODES, EPISODES = 8, 64
-# Times the time that steps should take; share of SYNCs (each tears a hole into a move): from here on worth a word.
+# Factor on the steps' nominal time, and share of SYNCs (each interrupts a move), from which on a warning is printed.
 SLOW, LATE = 1.05, 0.0005
 BUS_OPTIONS = ("bus", "interface", "channel", "node")
 OF_A_BUS_ALONE = ("bitrate", "device", "sensor")
@@ -174,7 +174,7 @@ def evaluate(
         before = None
         if on_bus:
             before = _way_back(out)
-            if not lockstep:  # what waits for SYNC is emulated
+            if not lockstep:  # drives that wait for SYNC are emulated
                 ask_to_turn(node, yes, interface)
             found = _on_bus(run, sensor, before, device=device, interface=interface, channel=channel,
                             nodes=node or None, lockstep=lockstep,
@@ -193,7 +193,7 @@ def evaluate(
 
 @dataclass(frozen=True)
 class _Run:
-    """An evaluation, on an emulator or a bus: a policy in its environment, by so many episodes."""
+    """An evaluation, on an emulator or a bus: a policy in its environment, for a number of episodes."""
 
     loaded: LoadedPolicy
     configuration: dict[str, Any]
@@ -219,12 +219,12 @@ class _Run:
 
 
 def _typed(context: typer.Context, names: Iterable[str]) -> list[str]:
-    """Return which of these options the user typed."""
+    """Return those of these options that the user typed."""
     return [name for name in names if was_typed(context, name)]
 
 
 def _check_numbers(episodes: int | None, gap: int | None, seed: int, limits: Mapping[str, float | None]) -> None:
-    """Raise ValueError for a number that cannot be; limits are times by their options' names."""
+    """Raise ValueError for an impossible number; limits are times by their options' names."""
     for name, value in (("--episodes", episodes), ("--gap", gap), ("--seed", seed + 1)):
         if value is not None and value < 1:
             least = 0 if name == "--seed" else 1
@@ -235,7 +235,7 @@ def _check_numbers(episodes: int | None, gap: int | None, seed: int, limits: Map
 
 
 def _check_side(context: typer.Context, lockstep: bool, gap: int | None, replay: Path | None) -> None:
-    """Raise ValueError for options of a side, bus or emulator, on which the episodes do not run."""
+    """Raise ValueError for options of the side, bus or emulator, on which the episodes do not run."""
     on_bus = bool(_typed(context, BUS_OPTIONS))
     if not on_bus and gap is None:
         if lockstep:
@@ -336,7 +336,7 @@ def _both_sides(
             lockstep=lockstep, guard=guard, told=show,
         )  # fmt: skip
     gaps = gap.text(gap.compare(both.inside, both.bus), "in process", "over CAN")
-    if both.again is not None:  # of the score alone: how much of its gap is chance
+    if both.again is not None:  # only of the score: how much of its gap is chance
         chance = gap.compare(both.inside, both.again)[:1]
         gaps += [f"noise alone: {line}" for line in gap.text(chance, "in process", "in process with other noise")]
     _tell(both.bus, gaps, json, missing=both.missing)
@@ -358,7 +358,7 @@ def _on_emulator(run: _Run) -> Evaluation:
 
 
 def _as_on_a_bus(run: _Run) -> Evaluation:
-    """Evaluate on an emulated machine that is hidden from the environment, as on a bus."""
+    """Evaluate on an emulated machine hidden from the environment, as on a bus."""
     from agents.evaluation.evaluation import GivenDrives, as_on_a_bus
     from agents.tasks import make_environments
     from drive_env.emulator.emulated_drives import EmulatedDrives
@@ -518,13 +518,13 @@ def _save(found: Any, folder: Path, gaps: list[str], json: bool) -> None:
     evaluation_plots.save(found, folder)
     if gaps:
         write_whole(folder / "gap.txt", "\n".join(gaps) + "\n")
-    found.save(folder / "report.json")  # last: a folder that has it is whole
+    found.save(folder / "report.json")  # last: a folder that has it is complete
     if not json:
         print(f"written to {folder}")
 
 
 def _tell_card(text: str, json: bool) -> None:
-    """Print how an agent was trained and what it reaches."""
+    """Print how an agent was trained, and its scores."""
     from agents.evaluation.open_policy import described_checkpoint, is_checkpoint, open_policy
 
     loaded = described_checkpoint(text) if is_checkpoint(text) else open_policy(text)
@@ -549,5 +549,5 @@ def _lines(table: Mapping[str, Any], indent: str = "") -> Iterator[str]:
 
 
 def _printable(text: str) -> str:
-    """Return a text of a foreign file without characters that act on the terminal."""
+    """Return text of an untrusted file without terminal control characters."""
     return "".join(one if one.isprintable() else "\N{REPLACEMENT CHARACTER}" for one in text)

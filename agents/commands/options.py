@@ -27,7 +27,7 @@ from tuning.runs.provenance import run_folder
 if TYPE_CHECKING:
     from tuning.runs.pools import Pool
 
-# Whatever takes long to import (torch, the compiler, MuJoCo, matplotlib) is imported by the command that needs it.
+# Slow imports (torch, the compiler, MuJoCo, matplotlib) are made by the command that needs them.
 
 # Packages of the extra `agents`, which training and ONNX need.
 OF_EXTRA = ("torch", "stable_baselines3", "sb3_contrib", "tensorboard", "onnx", "onnxruntime", "yaml")
@@ -55,10 +55,10 @@ Trust = Annotated[
 
 
 def new_folder(path: Path | None, name: str) -> Path:
-    """Return a folder for results that holds nothing yet; by default one named after time and command.
+    """Return an empty folder for results; by default one named after time and command.
 
     Raises:
-        ValueError: If it holds something.
+        ValueError: If it is not empty.
     """
     if path is None:
         path = run_folder(name)
@@ -69,12 +69,12 @@ def new_folder(path: Path | None, name: str) -> Path:
 
 @contextmanager
 def elsewhere(workers: int | None, cluster: str | None, again: str) -> Iterator[Pool | None]:
-    """Give where work runs that --workers or --cluster moves out of this process, None without either.
+    """Yield the pool of --workers or --cluster; None without either.
 
     Args:
-        workers: As `open_pool` takes it.
-        cluster: As `open_pool` takes it.
-        again: What to do when work is lost.
+        workers: As for `open_pool`.
+        cluster: As for `open_pool`.
+        again: Advice for lost work.
     """
     if workers is None and cluster is None:
         yield None
@@ -89,7 +89,7 @@ def elsewhere(workers: int | None, cluster: str | None, again: str) -> Iterator[
 
 @contextmanager
 def progress_bar(title: str) -> Iterator[Callable[[float], None]]:
-    """Show a progress bar on stderr, if that is a terminal; the function given takes the share done."""
+    """Show a progress bar on stderr, if that is a terminal; the yielded function takes the finished share."""
     if not sys.stderr.isatty():
         yield lambda share: None
         return

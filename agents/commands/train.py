@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from agents.training.training_run import Progress, Report
 
 EPISODES = 64  # for the card
-LINES = 10  # of progress, where the output is not a terminal
+LINES = 10  # of progress, if the output is not a terminal
 
 
 def train(
@@ -106,13 +106,13 @@ def train(
 
 
 def given_options(context: typer.Context) -> list[str]:
-    """Return the options and arguments that the user gave, as they are written."""
+    """Return the user's options and arguments as written."""
     sources = ((one, context.get_parameter_source(str(one.name))) for one in context.command.params)
     return [one.opts[0] for one, source in sources if source is not None and source.name == "COMMANDLINE"]
 
 
 def judged(bundle: AgentFile) -> tuple[AgentFile, Evaluation]:
-    """Return an agent with its figures on its card, and its evaluation on emulated machines."""
+    """Return an agent with its scores on its card, and its evaluation on emulated machines."""
     from agents.evaluation.evaluation import evaluate
     from agents.policies.policy import policy_of
     from agents.training.train import with_figures
@@ -125,7 +125,7 @@ def judged(bundle: AgentFile) -> tuple[AgentFile, Evaluation]:
 def with_load(
     environment: str, algorithm: str, preset: str, load: str | None, config: Path | None = None
 ) -> dict[str, Any]:
-    """Return hyper-parameters for a load: with the section that is named after it, where there is one."""
+    """Return hyper-parameters for a load: with the section named after it, if there is one."""
     from agents.training import hyperparameters
 
     section = load if load in hyperparameters.sections(environment, algorithm, config) else None
@@ -137,7 +137,7 @@ def with_load(
 
 @contextmanager
 def progress(title: str) -> Iterator[Report]:
-    """Show how far a training is, with speed and reward terms: a bar with a line below, or some lines in a file."""
+    """Show a training's progress, with speed and reward terms: a bar with a line below, or some lines in a file."""
     from rich.console import Console, Group
     from rich.live import Live
     from rich.progress import (
@@ -176,7 +176,7 @@ def progress(title: str) -> Iterator[Report]:
 
         def show(state: Any) -> None:
             bar.update(task, completed=state.timesteps / max(state.total, 1))
-            # On a line of its own: beside the bar a terminal of 80 columns would cut the terms off.
+            # On a separate line: beside the bar a terminal of 80 columns would truncate the terms.
             live.update(Group(bar, Text(text(state))))
 
         yield show

@@ -1,4 +1,4 @@
-"""Recorded episodes in a file, and a policy's actions in them: the same, if it is the same policy."""
+"""Recorded episodes in a file, and a policy's actions in them, which are equal for the same policy."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tuning.runs.inputs import as_kept
 
 
 class EpisodeRecording(NamedTuple):
-    """Episodes as a policy saw them: observations (steps, entries) and actions (steps, actions) of each, and seeds."""
+    """Episodes as seen by a policy: observations (steps, entries) and actions (steps, actions) of each, and seeds."""
 
     environment: str
     configuration: dict[str, Any]
@@ -90,17 +90,17 @@ def load(path: Path) -> EpisodeRecording:
 
 
 def repeat(policy: Any, recording: EpisodeRecording, told: Callable[[float], None] = lambda share: None) -> Repeated:
-    """Return how far a policy's actions on the recorded observations lie from the recorded ones.
+    """Return the difference of a policy's actions on the recorded observations from the recorded ones.
 
     Args:
-        policy: What acts.
+        policy: The policy.
         recording: The recording to compare with.
-        told: Called with the share that is done, episode by episode.
+        told: Called with the finished share, episode by episode.
 
     Raises:
-        PolicyStoppedError: If the policy fails on what was recorded, or gives another number of actions.
+        PolicyStoppedError: If the policy fails on a recorded observation, or gives another number of actions.
     """
-    unused = np.zeros(recording.actions[0].shape[1])  # never used: a policy that sticks does so in the recording, too
+    unused = np.zeros(recording.actions[0].shape[1])  # never used: a stuck policy is stuck in the recording, too
     watched = GuardedPolicy(policy, unused, unused, 0.0, PATIENT)
     largest, squares, count = 0.0, 0.0, 0
     try:

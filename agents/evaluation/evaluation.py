@@ -31,7 +31,7 @@ from mechanics.reading.untrusted import read_json
 from tuning.runs.inputs import as_kept, found_again, hashes, inputs_in
 
 LANES = 64
-TOLD = 0.5  # s between two looks at a progress bar, which takes a millisecond
+TOLD = 0.5  # s between two updates of a progress bar, which take a millisecond
 STEP_SECONDS: dict[str, Callable[[Any], float]] = {"ServoDrive/Tracking-v0": lambda config: 1.0 / config.rate,
                 "ServoDrive/GainScheduling-v0": lambda config: config.step,
                 "ServoDrive/GainTuning-v0": lambda config: TRIAL_SECONDS}  # fmt: skip
@@ -40,7 +40,7 @@ TRIAL_OF = {
     "measured": "trial_measured",
     "robust_cost": "trial_robust_cost",
 }  # of incumbent, of trial
-FIXED_STEPS = ("ServoDrive/Tracking-v0", "ServoDrive/GainScheduling-v0")  # a trial takes what clearing up takes besides
+FIXED_STEPS = ("ServoDrive/Tracking-v0", "ServoDrive/GainScheduling-v0")  # fault resets lengthen a trial
 
 
 @dataclass
@@ -52,13 +52,13 @@ class Evaluation:
         environment: Name of the environment.
         configuration: Its options.
         side: "emulator", "emulator as on a bus", or the bus.
-        seeds: Of the episodes.
+        seeds: Seeds of the episodes.
         values: Figure -> value of each episode.
         lower_is_better: Figure -> direction.
         violations: Cause of an early end -> number of episodes.
-        pace: Time that steps took over the time that they should; 1 where time waits, or a step has no fixed time.
-        late: Share of the SYNCs within a step that were more than a cycle late; 0 where time waits.
-        episodes: What was recorded; not saved with the report.
+        pace: Time of the steps over their nominal time; 1 in lockstep, or if steps have no fixed time.
+        late: Share of the SYNCs within a step that were more than a cycle late; 0 in lockstep.
+        episodes: The recorded episodes; not saved with the report.
     """
 
     policy: str
@@ -125,13 +125,13 @@ def as_on_a_bus(drives: Drives) -> Drives:
 
 @dataclass(frozen=True)
 class GivenDrives:
-    """Drives that a policy acts on, in place of emulated machines of the environment's own.
+    """Drives for a policy, instead of the environment's own emulated machines.
 
     Attributes:
-        drives: The drives; their gains, offsets and mode are as before after an evaluation.
-        sensor: As `Tracking` takes it.
+        drives: The drives; their gains, offsets and mode are restored after an evaluation.
+        sensor: As for `Tracking`.
         guard: Limits of the policy; those of guard.LIMITS by default.
-        side: What the report calls the drives.
+        side: Name of the drives in the report.
     """
 
     drives: Drives
@@ -155,18 +155,18 @@ def evaluate(
     """Run episodes and return the results.
 
     Args:
-        policy: What acts: `act(observations)`, shape (environments, entries), and `reset(mask)`.
+        policy: The policy: `act(observations)`, shape (environments, entries), and `reset(mask)`.
         environment: Name of the environment.
         configuration: Its options.
-        name: Of the policy, for the report.
-        episodes: How many; each has a seed of its own, `seed`, `seed` + 1, ...
-        seed: Of the first one.
-        on: Drives to act on; emulated machines of the environment's own by default.
-        told: Called with the share that is done.
-        at_once: Episodes side by side on emulated machines; by default `environments_for` as many.
+        name: Name of the policy, for the report.
+        episodes: Number of episodes, with the seeds `seed`, `seed` + 1, ...
+        seed: Seed of the first one.
+        on: Drives to act on; None: the environment's own emulated machines.
+        told: Called with the finished share.
+        at_once: Parallel episodes on emulated machines; None: those of `environments_for`.
 
     Raises:
-        PolicyStoppedError: If the policy did what it must not; given drives are at rest and disabled then.
+        PolicyStoppedError: If the guard stopped the policy; given drives are then at rest and disabled.
         ValueError: For an invalid configuration.
     """
     environment = environment_name(environment)
@@ -211,7 +211,7 @@ def _how_to_act_on(on: GivenDrives) -> dict[str, Any]:
 
 
 def _guarded(policy: Any, lanes: Any, environment: str, on: GivenDrives | None) -> GuardedPolicy:
-    """Return the policy with its limits: those of given drives, and hardly any where nothing can break."""
+    """Return the policy with its limits: those of given drives, and very wide ones for emulated machines."""
     limits = PATIENT if on is None else on.guard or LIMITS[environment_of(environment)]
     space = lanes.single_action_space
     return GuardedPolicy(policy, space.low, space.high, STEP_SECONDS[environment_of(environment)](lanes.config), limits)
@@ -220,15 +220,15 @@ def _guarded(policy: Any, lanes: Any, environment: str, on: GivenDrives | None) 
 def _all_rounds(
     policy: Any, lanes: Any, environment: str, seeds: range, all_end: bool, told: Callable[[float], None]
 ) -> tuple[list[Episode], float]:
-    """Return an episode of every seed, as many at a time as there are environments, and the steps' time over its due.
+    """Return an episode of every seed, run in parallel in all environments, and the steps' time over its nominal one.
 
     Args:
-        policy: What acts.
+        policy: The policy.
         lanes: The environments.
         environment: Their name.
-        seeds: Of the episodes.
-        all_end: As `_episodes` has it.
-        told: Called with the share that is done.
+        seeds: Seeds of the episodes.
+        all_end: As for `_episodes`.
+        told: Called with the finished share.
     """
     step, steps = STEP_SECONDS[environment_of(environment)](lanes.config), row_of(environment).steps(lanes.config)
     recorded: list[Episode] = []
@@ -239,7 +239,7 @@ def _all_rounds(
         def tell(done: int, first: int = first, wanted: int = wanted) -> None:
             told((first + wanted * min(done / steps, 1.0)) / len(seeds))
 
-        own = [seeds.start + first + lane for lane in range(lanes.num_envs)]  # the last round's have more than `seeds`
+        own = [seeds.start + first + lane for lane in range(lanes.num_envs)]  # the last round may go beyond `seeds`
         found, seconds = _episodes(policy, lanes, own, all_end=all_end, told=tell)
         recorded += found[:wanted]
         spent += seconds
@@ -248,12 +248,12 @@ def _all_rounds(
 
 
 def environments_for(episodes: int) -> int:
-    """Return how many of so many episodes run at the same time on emulated machines."""
+    """Return the number of parallel episodes on emulated machines, for a number of episodes."""
     return min(episodes, LANES)
 
 
 def joined(parts: Sequence[Evaluation]) -> Evaluation:
-    """Return evaluations of one policy on one side, an episode after the other, as one."""
+    """Join evaluations of one policy on one side."""
     first = parts[0]
     names = [name for name in first.values if all(name in part.values for part in parts)]
     violations: dict[str, int] = {}
@@ -297,12 +297,11 @@ def _episodes(
     """Return an episode of every environment, and the time that its steps took [s].
 
     Args:
-        policy: What acts.
+        policy: The policy.
         lanes: The environments.
         seeds: One for each environment.
-        all_end: Whether every environment's episode ends with the first that does: beginning anew would move the
-            others.
-        told: Called with the number of steps done, not more often than every TOLD.
+        all_end: Whether all episodes end with the first that does, since a reset would move the other drives.
+        told: Called with the number of finished steps, at most every TOLD.
     """
     count = lanes.num_envs
     observation, begun = lanes.reset(seed=list(seeds))
@@ -318,7 +317,7 @@ def _episodes(
     faults: list[str] = [""] * count
     last: list[dict[str, Any]] = [{} for _ in range(count)]
     open_ = np.ones(count, bool)
-    trials = [{name: begun[name] for name in TRIAL_OF if name in begun}]  # the first is of the gains at the begin
+    trials = [{name: begun[name] for name in TRIAL_OF if name in begun}]  # the first one is of the initial gains
     start = last_told = time.perf_counter()
     while open_.any():
         action = policy.act(rows[-1])
@@ -364,7 +363,7 @@ def _episodes(
 
 
 def _stepped(policy: Any, lanes: Any, action: Any, open_: Any) -> Any:
-    """Make a step; a policy that knows its machines is given those whose payload changes within an episode anew."""
+    """Make a step; a policy that knows its machines is notified of those whose payload changes within an episode."""
     found = lanes.step(action)
     if hasattr(lanes.config, "payload"):
         policy.told(found[4].get("parameters"), open_)
@@ -372,12 +371,12 @@ def _stepped(policy: Any, lanes: Any, action: Any, open_: Any) -> Any:
 
 
 def _stay_with(gains: Any, trials: Sequence[Mapping[str, Any]], last: Sequence[dict[str, Any]]) -> None:
-    """Let the end of episodes tell of a tuner's own answers, which are gains that it tried, instead of incumbents.
+    """Replace the incumbents at the end of episodes by a tuner's own answers, which are gains that it tried.
 
     Args:
         gains: The answers, (environments, axes, count).
         trials: The info of every trial of all environments, by the names of TRIAL_OF.
-        last: What the environment told in the last step of each environment; changed.
+        last: The info of each environment's last step; changed.
     """
     for lane, told in enumerate(last):
         for trial in trials:
@@ -389,12 +388,11 @@ def _stay_with(gains: Any, trials: Sequence[Mapping[str, Any]], last: Sequence[d
 
 
 def _seen(observation: Any) -> Any:
-    """Return the policy's part of an observation: of a dict its `observation`; a copy, since it is kept."""
+    """Return a copy of the policy's part of an observation: for a dict its entry `observation`."""
     return np.array(observation["observation"] if isinstance(observation, dict) else observation)
 
 
 def _of_environment(info: Mapping[str, Any], lane: int) -> dict[str, Any]:
-    """Return the numbers and texts of an info for one environment."""
     found = {}
     for key, value in info.items():
         if key.startswith("_") or isinstance(value, Mapping) or np.ndim(value) < 1:
@@ -404,7 +402,7 @@ def _of_environment(info: Mapping[str, Any], lane: int) -> dict[str, Any]:
 
 
 def _num_envs_of(environment: str, drives: Drives, options: Mapping[str, Any]) -> int:
-    """Return how many environments given drives make: each has the axes of the load."""
+    """Return the number of environments for given drives: each has the axes of the load."""
     from mechanics.loads import find_load
 
     load = options.get("load")

@@ -1,4 +1,4 @@
-"""Episodes of a policy on processes and clusters, with the same results as here: each round is a task."""
+"""Episodes of a policy on processes and clusters, with the same results as in this process: each round is a task."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 
 
 class Written(NamedTuple):
-    """A policy as its user wrote it, with the content of its file, so that it can be opened on another machine.
+    """A policy's name and the content of its file, so that it can be opened on another machine.
 
     Attributes:
-        text: What names it.
-        content: Of the file that the text names, None if it names none.
+        text: Its name.
+        content: Content of the named file, None if it is not a file.
         source: Hash of the file of the Python function that the text names, "" for other texts: it is not sent, and the
-            machine that opens it must have the same.
-        trust: As `open_policy` takes it.
+            other machine must have the same.
+        trust: As for `open_policy`.
     """
 
     text: str
@@ -37,7 +37,7 @@ class Written(NamedTuple):
 
     @classmethod
     def of(cls, text: str, trust: bool) -> Written:
-        """Read the policy that a text names."""
+        """Read the policy named by a text."""
         content = read_bytes(text, MOST_ARRAYS) if names_a_file(text) else None
         return cls(text, content, trust, source_of(text) if content is None else "")
 
@@ -78,7 +78,6 @@ def _run(task: _Round) -> list[Episode]:
 
 
 def _is_of(task: _Round, found: Any) -> bool:
-    """Return whether episodes are those of a round."""
     seeds = [episode.seed for episode in found if len(episode.observations) == len(episode.actions) + 1]
     return seeds == list(range(task.seed, task.seed + task.episodes))
 
@@ -94,7 +93,7 @@ def evaluate_elsewhere(
     seed: int,
     told: Callable[[float], None] = lambda share: None,
 ) -> Evaluation:
-    """Run episodes on emulated machines and return the evaluation, as `evaluate` does, wherever the pool runs them."""
+    """Run episodes on emulated machines and return the evaluation, as `evaluate` does, on any pool."""
     environment, options = environment_name(environment), taken_options(configuration)
     at_once = environments_for(episodes)
     rounds = [

@@ -17,11 +17,11 @@ EMULATOR = "emulator"  # as a side: machines that are drawn for each episode
 class Gap(NamedTuple):
     """A figure on two sides.
 
-    first, second: Of the two sides.
-    difference: Second less first, with its 95 % interval; paired by seed where both ran the same episodes.
+    first, second: The figure on the two sides.
+    difference: Second minus first, with its 95 % interval; paired by seed where both ran the same episodes.
     paired: Whether they did.
-    medians: (low, value, high) of the quotient of the medians less 1, second over first, with its 95 % interval; NaN
-        where the first one is 0.
+    medians: (low, value, high) of the quotient of the medians minus 1, second over first, with its 95 % interval; NaN
+        if the first one is 0.
     """
 
     figure: str
@@ -55,7 +55,7 @@ def compare(first: Evaluation, second: Evaluation) -> list[Gap]:
 def _met_the_same(first: Evaluation, second: Evaluation) -> bool:
     """Return whether episodes of one seed have the same machine on both sides.
 
-    Emulated machines are drawn by the seed, from the configuration, and a bus has its own.
+    Emulated machines are drawn by the seed from the configuration; the machines of a bus are fixed.
     """
     if EMULATOR not in (first.side, second.side):
         return True
@@ -63,7 +63,7 @@ def _met_the_same(first: Evaluation, second: Evaluation) -> bool:
 
 
 def text(gaps: list[Gap], first: str, second: str) -> list[str]:
-    """Return lines that say it."""
+    """Return the gap as lines of text."""
     lines = []
     for gap in gaps:
         share = f", {gap.difference.mean / abs(gap.first.mean):+.1%}" if gap.first.mean else ""

@@ -1,9 +1,8 @@
 """The greatest sensitivity Ms of loops with a policy in them, measured in the emulator.
 
-Every episode is run twice, alike to the last random number; in the second, a torque of many frequencies pushes one
-axis. By how much the motor's torque differs between the two tells how much of the push the loops answer, drives and
-policy together: S = 1 + (difference of the motor's torque) / push, all other axes' loops closed. No linear model is
-needed, and no knowledge of the policy.
+Every episode is run twice with equal random numbers; in the second, a torque of many frequencies pushes one axis. The
+difference of the motor's torque gives the response of the loops, drives and policy together: S = 1 + (difference of the
+motor's torque) / push, with all other axes' loops closed. Neither a linear model nor knowledge of the policy is needed.
 """
 
 from __future__ import annotations
@@ -25,13 +24,13 @@ from drive_env.loops.dynamics import Dynamics
 from drive_env.motors import find_motor
 from mechanics.arrays import Complex, Floats
 
-MACHINES = 32  # that are drawn
-REPEATS = 4  # of every machine, with other trajectories and phases, against non-linear parts
-SETTLING = 0.2  # of an episode, left out: the push has only begun
+MACHINES = 32  # number of drawn machines
+REPEATS = 4  # of every machine, with other trajectories and phases, to average out non-linear effects
+SETTLING = 0.2  # beginning of an episode [s] that is left out, until the push is in steady state
 LINES, LOWEST, HIGHEST = 40, 4.0, 0.3  # frequencies, from [Hz], to this share of the rate of actions
 PUSH = 0.05  # of the motor's rated torque, root mean square
 AXIS_ENTRIES, ERRORS = 8, (0, 1)  # of an axis in Tracking's observation: of them the errors of position and speed
-SHARES = (1.0, 0.85, 0.7, 0.6, 0.5, 0.4, 0.3)  # of an agent's answer to these errors that are tried
+SHARES = (1.0, 0.85, 0.7, 0.6, 0.5, 0.4, 0.3)  # shares of an agent's response to these errors that are tried
 
 
 class Sensitivity(NamedTuple):
@@ -62,15 +61,15 @@ def measure_sensitivity(
     """Measure the loops of drawn machines with a policy in them.
 
     Args:
-        policy: What acts: `act(observations)`, `reset(mask)`.
+        policy: The policy: `act(observations)`, `reset(mask)`.
         environment: Tracking or a task of it.
         configuration: Its options.
-        machines: How many are drawn.
-        seed: Of machines and trajectories.
-        told: Called with the share that is done.
+        machines: Number of drawn machines.
+        seed: Seed of machines and trajectories.
+        told: Called with the finished share.
 
     Raises:
-        ValueError: For an environment whose actions are no set-points of each cycle.
+        ValueError: For an environment whose actions are not set-points of each cycle.
     """
     name = environment_name(environment)
     if environment_of(name) != "ServoDrive/Tracking-v0":
@@ -95,7 +94,7 @@ def measure_sensitivity(
 
 
 class NotKeptError(ValueError):
-    """The loops with an agent in them do not keep the requirements; the message says by how much."""
+    """The loops with an agent in them violate the requirements; the message says by how much."""
 
 
 def check_kept(found: Sensitivity, dynamics: Dynamics) -> None:
@@ -119,10 +118,10 @@ def within(
 ) -> tuple[AgentFile, Sensitivity]:
     """Return an agent that answers following errors less, so that its loops keep the dynamics, and these loops.
 
-    Its lead over its set-points stays as it is. Its card says by how much its answer is lowered.
+    Its lead over its set-points is unchanged. Its card has the reduction of its response.
 
     Raises:
-        NotKeptError: If the least of SHARES does not keep them.
+        NotKeptError: If even the least of SHARES violates them.
     """
     for k, share in enumerate(SHARES):
         agent = _answering(bundle, share)
@@ -148,7 +147,7 @@ def figures(found: Sensitivity) -> dict[str, float]:
 
 
 def _answering(bundle: AgentFile, share: float) -> AgentFile:
-    """Return an agent that sees so much of the errors of position and speed alone."""
+    """Return an agent that sees only a share of the errors of position and speed."""
     mean, scale = (np.array(bundle.arrays[f"observation_{name}"], float) for name in ("mean", "scale"))
     for axis in range(len(mean) // AXIS_ENTRIES):
         for entry in ERRORS:

@@ -30,7 +30,7 @@ def save(name: str, found: Evaluation) -> None:
     terminated, truncated = ends_of(found.episodes)
     buffers: list[Any] = []
     with gymnasium.make(f"drive_env:{found.environment}", config=found.configuration) as env, warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # it wants an author and an address, which are not known here
+        warnings.simplefilter("ignore", UserWarning)  # it asks for an author and an address, which are unknown here
         space = env.observation_space
         first = 0
         for number, episode in enumerate(found.episodes):

@@ -1,4 +1,4 @@
-"""Drives of a bus for an evaluation: inside an envelope made for the task, with everything compiled before."""
+"""Drives of a bus for an evaluation: inside an envelope for the task, with everything compiled in advance."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ if TYPE_CHECKING:
     from drive_env.drives.interface import Drives
     from tuning.target import Target
 
-# Of the task's amplitude and speed: what a policy may do beyond them before the envelope stops it.
+# Of the task's amplitude and speed: factors beyond which the envelope stops a policy.
 POSITION_SLACK, SPEED_SLACK = 1.5, 2.0
 
 
 @contextmanager
 def drives_for(environment: str, configuration: Mapping[str, Any], guard: GuardLimits, **options: Any) -> Iterator[Any]:
-    """Open drives on a bus for a policy, as `target_for` does, and give them alone."""
+    """Open drives on a bus for a policy, as `target_for` does, and yield only them."""
     with target_for(environment, configuration, guard, **options) as target:
         yield target.drives
 
@@ -46,10 +46,10 @@ def target_for(
 ) -> Iterator[Target]:
     """Open drives on a bus for a policy; they are at rest and disabled afterwards.
 
-    Only the drives of the target matter, and how they are opened again: not motor, supply and travel.
+    Only the target's drives and the way to reopen them are used, not motor, supply and travel.
 
-    The envelope's limits are the task's: about the place where the axes stand now, half as far again as the amplitude,
-    and twice the speed; the drive's own limits hold besides. Its watch for stalls is the guard's.
+    The envelope's limits follow the task: 1.5 times the amplitude around the axes' present positions, and twice the
+    speed; the drive's own limits apply, too. The stall limit is the guard's.
 
     Raises:
         BusError: If the bus cannot be opened or a node does not answer.
@@ -74,7 +74,7 @@ def target_for(
         reach = POSITION_SLACK * amplitude * turn
         position = ((at - reach).tolist(), (at + reach).tolist())
         velocity = (SPEED_SLACK * speed * speed_turn).tolist()
-    # A trial of gains may oscillate: it sees that and stops the environment by itself.
+    # A trial of gains may oscillate: it detects that and stops the environment by itself.
     oscillation = environment_of(environment_name(environment)) != "ServoDrive/GainTuning-v0"
     limits = Limits(position=position, velocity=velocity, oscillation=oscillation, stall=guard.stall)
     with on_bus(travel=FREE, safety=limits, **more) as target:
@@ -82,17 +82,17 @@ def target_for(
 
 
 def lower_profile_velocity(drives: Drives) -> None:
-    """Lower 6081h where it is beyond the envelope's limit, which would refuse to write it back between episodes."""
+    """Lower 6081h if it is beyond the envelope's limit, which would refuse to restore it between episodes."""
     if not drives.safety:
         return
     limit = given(drives.safety.limits.velocity, drives.num_axes)
     now = drives.read(cia402.PROFILE_VELOCITY)
-    if np.any(beyond := now > limit):  # nan, where there is no limit, compares false
+    if np.any(beyond := now > limit):  # nan, without a limit, compares false
         drives.write(cia402.PROFILE_VELOCITY, np.where(beyond, np.floor(limit), now).astype(np.int64), where=beyond)
 
 
 def warm_up(environment: str, configuration: Mapping[str, Any]) -> None:
-    """Compile the environment's kernels, on an emulated machine: a policy would else stall in its first step."""
+    """Compile the environment's kernels on an emulated machine; otherwise a policy would stall in its first step."""
     lanes = make_environments(environment, 1, _emulated(configuration))
     space: Any = lanes.action_space
     lanes.reset(seed=0)

@@ -1,6 +1,6 @@
 """Opens any policy: an agent file, a checkpoint of Stable-Baselines3, ONNX, or a Python callable.
 
-How it is written says what it is: the name of an agent that ships, agent.npz, checkpoint.zip (ours, or what
+The form of the text selects it: the name of a shipped agent, agent.npz, checkpoint.zip (ours, or what
 Stable-Baselines3's `save` writes), agent.onnx, or module:function.
 """
 
@@ -22,7 +22,7 @@ from agents.shipped import shipped, shipped_names
 from mechanics.reading.untrusted import read_bytes
 from tuning.runs.inputs import found_again
 
-CHECKPOINT = ".zip"  # ending of a file of Stable-Baselines3, which holds pickles
+CHECKPOINT = ".zip"  # ending of a file of Stable-Baselines3, which contains pickles
 
 
 class PolicyNotFoundError(ValueError):
@@ -35,10 +35,10 @@ class LoadedPolicy:
 
     Attributes:
         name: As the user wrote it.
-        policy: What acts: `act(observation)`, `reset(mask)`.
+        policy: The policy: `act(observation)`, `reset(mask)`.
         environment: Name of the environment that it was trained in; None if unknown.
-        configuration: The environment's options then.
-        card: What is known of it.
+        configuration: The environment's options in training.
+        card: Its description.
     """
 
     name: str
@@ -49,15 +49,15 @@ class LoadedPolicy:
 
 
 def open_policy(text: str, *, trust: bool = False) -> LoadedPolicy:
-    """Return the policy that a text names.
+    """Return the policy named by a text.
 
     Args:
-        text: What names it.
-        trust: The author of a checkpoint is trusted: loading it runs code that it contains. The other files run no
+        text: The name.
+        trust: Whether the author of a checkpoint is trusted: loading it runs code that it contains. Other files run no
             code, and a Python function is the user's own.
 
     Raises:
-        PolicyNotFoundError: If it names no policy; BundleError or CheckpointError if its file is not what it seems;
+        PolicyNotFoundError: If it does not name a policy; BundleError or CheckpointError for an invalid file;
             UntrustedError for a checkpoint without `trust`.
     """
     if is_checkpoint(text):
@@ -82,13 +82,13 @@ def open_policy(text: str, *, trust: bool = False) -> LoadedPolicy:
 def opened(
     text: str, environment: str | None, configuration: Mapping[str, Any], *, trust: bool = False
 ) -> LoadedPolicy:
-    """Return the policy that a text names, a baseline in its environment with these options among them.
+    """Return the policy named by a text, or the baseline in its environment with these options.
 
     Args:
-        text: What names it.
-        environment: Name of the environment; a baseline is of one.
+        text: The name.
+        environment: Name of the environment; required for a baseline.
         configuration: The environment's options.
-        trust: As `open_policy` takes it.
+        trust: As for `open_policy`.
     """
     from agents.policies.baselines import baseline
     from agents.tasks import make_environments
@@ -104,21 +104,21 @@ def opened(
 
 
 def names_a_file(text: str) -> bool:
-    """Return whether a text names a policy by the file that holds it."""
+    """Return whether a text names a policy by its file."""
     return text.lower().endswith((*OPENERS, CHECKPOINT))
 
 
 def is_baseline(text: str) -> bool:
-    """Return whether a text names a baseline, which acts in whatever environment is asked for."""
+    """Return whether a text names a baseline, which exists in several environments."""
     from agents.policies.baselines import BASELINES, SUITE_TASKS
 
     return any(text in rows for rows in (*BASELINES.values(), *SUITE_TASKS.values()))
 
 
 class CallablePolicy:
-    """A Python function of an observation; it gets those of all environments at once, shape (environments, entries).
+    """A Python function of an observation; it is called with those of all environments, shape (environments, entries).
 
-    A class, or an object with `act`, is taken as it is.
+    A class, or an object with `act`, is used unchanged.
     """
 
     def __init__(self, function: Callable[[Any], Any]) -> None:
@@ -144,7 +144,7 @@ class ModelPolicy:
         """Return the model's action."""
         rows: Any = np.atleast_2d(observation)
         lanes = len(rows)
-        if hasattr(self.model.observation_space, "spaces"):  # what only the critic saw does not matter to the actor
+        if hasattr(self.model.observation_space, "spaces"):  # the actor needs no entries of the critic
             spaces = self.model.observation_space.spaces
             rows = {key: rows if key == ACTOR else np.zeros((lanes, *spaces[key].shape)) for key in spaces}
         if self._normaliser is not None:
@@ -177,14 +177,14 @@ def _onnx(text: str) -> LoadedPolicy:
 
 
 def is_checkpoint(text: str) -> bool:
-    """Return whether a text names a checkpoint, the one kind of file that runs code of its writer."""
+    """Return whether a text names a checkpoint, the only type of file that runs its writer's code."""
     return text.lower().endswith(CHECKPOINT)
 
 
 def described_checkpoint(text: str) -> LoadedPolicy:
-    """Return the description of a checkpoint, its policy None: nothing of its writer is run.
+    """Return the description of a checkpoint, its policy None: none of its writer's code is run.
 
-    A file of Stable-Baselines3's own says nothing of its environment.
+    A file of Stable-Baselines3 itself does not name its environment.
 
     Raises:
         CheckpointError: If the file is not a checkpoint.
@@ -213,13 +213,13 @@ def find_object(text: str) -> Any:
     """Import the object of module:name; the present folder's modules count, too.
 
     Raises:
-        PolicyNotFoundError: If there is no such thing, or its module cannot be imported.
+        PolicyNotFoundError: If there is no such object, or its module cannot be imported.
     """
     module, colon, name = text.partition(":")
     if not colon or not name:
         raise PolicyNotFoundError(f"{text!r} must be module:function")
     folder = str(Path.cwd())
-    if folder not in sys.path:  # a console script's path lacks it, and the user's function is there
+    if folder not in sys.path:  # a console script's path lacks it, but the user's function is there
         sys.path.insert(0, folder)
     try:
         found = importlib.import_module(module)
@@ -236,7 +236,7 @@ def find_object(text: str) -> Any:
 def source_of(text: str) -> str:
     """Return the hash of the file that holds module:function; "" if the text names no function, or it has no file.
 
-    What the module itself imports is not in it.
+    The module's own imports are not included.
     """
     if ":" not in text:
         return ""
@@ -261,5 +261,5 @@ def _callable(text: str) -> LoadedPolicy:
     return LoadedPolicy(text, policy)
 
 
-# Ending of a file that runs nothing of its writer -> what opens it.
+# Ending of a file that runs no code of its writer -> function that opens it.
 OPENERS: dict[str, Callable[[str], LoadedPolicy]] = {".npz": _bundle, ".onnx": _onnx}

@@ -20,14 +20,14 @@ from tuning.bootstrap import bootstrap_interval
 class Episode(NamedTuple):
     """An episode of one environment, as recorded.
 
-    seed: Of the episode.
+    seed: Seed of the episode.
     observations: Shape (steps + 1, entries); the last one is the final one.
     actions: Shape (steps, actions).
     rewards: Shape (steps,).
     terms: Reward term -> values, shape (steps,).
     terminated: Whether it ended early, which is a violation.
-    fault: What ended it; "" if nothing did.
-    first, last: The environment's info at its begin and in its last step, of this environment.
+    fault: Cause of its end; "" if it was not ended early.
+    first, last: This environment's info at the beginning and in the last step.
     """
 
     seed: int
@@ -44,8 +44,8 @@ class Episode(NamedTuple):
 class Figure(NamedTuple):
     """A figure of an episode.
 
-    name: With its unit.
-    compute: From the episode and the environment's configuration (as the environment has it).
+    name: Name with unit.
+    compute: Computes it from the episode and the environment's configuration.
     lower_is_better: Direction.
     """
 
@@ -76,7 +76,7 @@ def current(episode: Episode, config: Any) -> float:
 
 
 def upright(episode: Episode, config: Any) -> float:
-    """Return the share of the episode's time that it lasted."""
+    """Return the episode's duration over its full time."""
     return float(len(episode.rewards) / config.steps)
 
 
@@ -93,7 +93,7 @@ def _told(name: str) -> Callable[[Episode, Any], float]:
 
 
 def constraints_kept(episode: Episode, config: Any) -> float:
-    """Return 1 where the answer of GainTuning keeps the constraints, else 0; NaN on given drives, which do not tell."""
+    """Return 1 if the answer of GainTuning keeps the constraints, else 0; NaN on given drives, where it is unknown."""
     cost = _told("robust_cost")(episode, config)
     return cost if np.isnan(cost) else float(cost < TRIP)
 
@@ -103,7 +103,7 @@ def _mean_term(name: str) -> Callable[[Episode, Any], float]:
 
 
 def stopped(episode: Episode, config: Any) -> float:
-    """Return the share of trials stopped for oscillation or fault; NaN if that costs nothing."""
+    """Return the share of trials stopped for oscillation or fault; NaN if stops have no cost."""
     if not config.abort_cost or "abort" not in episode.terms:
         return float("nan")
     return float(np.mean(np.asarray(episode.terms["abort"]) < 0.0))
@@ -116,7 +116,7 @@ def total(episode: Episode, config: Any) -> float:
 
 RETURN = Figure("return", total, lower_is_better=False)
 
-# Environment -> its figures; the first one is the score, but see `figures`.
+# Environment -> its figures; the first one is the score, except as in `figures`.
 FIGURES: dict[str, tuple[Figure, ...]] = {
     "ServoDrive/Tracking-v0": (
         Figure("RMS following error [rev]", following_error),
@@ -141,7 +141,7 @@ FIGURES: dict[str, tuple[Figure, ...]] = {
 
 
 def figures(environment: str, config: Any) -> tuple[Figure, ...]:
-    """Return the figures of an environment, the score first: where a pole can fall, the time that it stood."""
+    """Return the figures of an environment, the score first: if a pole can fall, the time that it stood."""
     found = FIGURES[environment_of(environment)]
     if environment in TASKS:
         steps = TASKS[environment].steps

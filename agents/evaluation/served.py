@@ -1,7 +1,7 @@
 """Machines drawn from a task's distributions, and their drives served on a bus as real ones would be.
 
-In real time `drive-env serve` runs in a process of its own, so that policy and drive share no interpreter; in lockstep
-a thread of this process does, since no time passes while it waits.
+In real time `drive-env serve` runs in a separate process, so that policy and drive share no interpreter; in lockstep it
+runs in a thread of this process, since no time passes while it waits.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import numpy as np
 from drive_env.bus.config import Machine
 from drive_env.drives.interface import Drives
 
-STARTING = 180.0  # s until a served bus is up: kernels that are not in the cache are compiled first
+STARTING = 180.0  # s until a served bus is up, including compilation of kernels missing in the cache
 ENDING = 20.0  # s
 _CHANNEL = re.compile(r'channel="(socket://[^"]+)"')
 
@@ -32,7 +32,7 @@ class ServeError(RuntimeError):
 
 
 class Served(NamedTuple):
-    """A machine on a bus: where its nodes are, and the emulated drives if they are in this process."""
+    """A machine on a bus: its address, and the emulated drives if they are in this process."""
 
     channel: str
     nodes: tuple[int, ...]
@@ -42,12 +42,12 @@ class Served(NamedTuple):
 def draw_machines(config: Any, count: int, seed: int) -> list[Machine]:
     """Return machines of a task's configuration, drawn anew for each number; nodes are counted from 1.
 
-    Properties that a row of a bus cannot hold stay as they are: supply, temperatures, and the delays of the bus.
+    Properties without a key in a bus file keep their defaults: supply, temperatures, and the delays of the bus.
 
     Args:
-        config: An environment's configuration; its distributions, or those that ship for its load.
-        count: How many.
-        seed: Machine k of a seed is the same whatever the count.
+        config: An environment's configuration; its distributions, or the shipped ones of its load.
+        count: Number of machines.
+        seed: Machine k of a seed is the same for any count.
 
     Raises:
         ValueError: For a load that is not a name, or friction that is not served.
@@ -100,9 +100,9 @@ def in_lockstep(machine: Machine, seed: int) -> Iterator[Served]:
 
 @contextmanager
 def in_real_time(machine: Machine, seed: int) -> Iterator[Served]:
-    """Have `drive-env serve` serve a machine in real time, in a process of its own.
+    """Serve a machine by `drive-env serve` in real time, in a separate process.
 
-    A bus of its own, too: with the PDOs of several drives 1 Mbit/s would be full.
+    It has a separate bus, too, since the PDOs of several drives would fill 1 Mbit/s.
 
     Raises:
         ServeError: If it does not come up.

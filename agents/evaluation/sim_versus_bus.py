@@ -1,7 +1,7 @@
 """A policy on the same machines twice: in this process, and over the bus on which they are served.
 
-In lockstep the two must agree to the bit. In real time they differ by what the clock brings in: when a set-point
-arrives, how long an axis rested before a move, which noise it met. What that does to the figures is the gap.
+In lockstep the two must agree bit by bit. In real time they differ in times: when a set-point arrives, how long an axis
+rested before a move, and so the noise. The resulting difference of the figures is the gap.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ if TYPE_CHECKING:
     pass
 
 ROBUST_COST = "robust cost"
-PATIENCE = 30.0  # s, for a node that waits for us: a late answer says that the computer is busy, not that it is gone
+PATIENCE = 30.0  # s, for a served node: a late answer means that the computer is busy, not that the node is gone
 OTHER_NOISE = 1_000_003  # added to the seed of the drives' noise
 
 
 class BothSides(NamedTuple):
     """The results.
 
-    inside, bus: The evaluations, an episode of each machine that was judged on both sides, in the same order.
-    again: In this process once more, with other noise: what the gap may be without any bus; None in lockstep.
-    missing: Machine -> why it could not be judged on both sides.
+    inside, bus: The evaluations, an episode of each machine that was evaluated on both sides, in the same order.
+    again: A second evaluation in this process with other noise: the gap without any bus; None in lockstep.
+    missing: Machine -> why it could not be evaluated on both sides.
     """
 
     inside: Evaluation
@@ -61,20 +61,20 @@ def on_both_sides(
     """Run an episode of a policy on each of some machines, in this process and over their bus.
 
     Args:
-        policy: What acts.
+        policy: The policy.
         environment: Name of the environment.
-        configuration: Its options; its distributions say what machines there are.
-        machines: How many.
-        seed: Of machines and episodes; episode k is that of seed + k.
-        name: Of the policy.
-        lockstep: Serve them in lockstep instead of in real time.
+        configuration: Its options; its distributions define the machines.
+        machines: Number of machines.
+        seed: Seed of machines and episodes; episode k has seed + k.
+        name: Name of the policy.
+        lockstep: Whether to serve them in lockstep instead of in real time.
         guard: Limits of the policy over the bus.
-        told: Called with the share that is done.
+        told: Called with the finished share.
 
     Raises:
-        PolicyStoppedError: If the policy did in this process what it must not.
+        PolicyStoppedError: If the guard stopped the policy in this process.
         ValueError: For a load that cannot be served.
-        BusError: If no machine could be judged over the bus.
+        BusError: If no machine could be evaluated over the bus.
     """
     environment = environment_name(environment)
     lanes: Any = make_environments(environment, 1, configuration)

@@ -1,7 +1,7 @@
-"""The file of a trained agent: one small .npz with everything in it that acting needs, and where it comes from.
+"""The file of a trained agent: one small .npz with everything needed to act, and its origin.
 
-It holds arrays without pickles and, as `about`, JSON: kind, settings, environment with its configuration, card,
-versions and a hash of all that. The observation's normaliser is among the arrays, never in a second file.
+It contains arrays without pickles and, as `about`, JSON: kind, settings, environment with its configuration, card,
+versions and a hash of all that. The observation's normaliser is one of the arrays, never a second file.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from mechanics.reading.untrusted import TooLargeError, parse_json, read_arrays
 from tuning.runs.inputs import as_kept, found_again
 
 FORMAT, FORMAT_VERSION = "drive-agent", 1
-MAX_BYTES = 1_000_000  # of a file: what ships in the package and is read by a small computer
-MOST_UNPACKED = 20_000_000  # bytes; weights hardly pack, so that an agent of MAX_BYTES has some 2 MB
-# What the JSON says besides format and hash.
+MAX_BYTES = 1_000_000  # of a file, which ships in the package and is read by a small computer
+MOST_UNPACKED = 20_000_000  # bytes; weights hardly compress, so that an agent of MAX_BYTES has some 2 MB
+# Keys of the JSON besides format and hash.
 KINDS_OF_ABOUT = {"kind": str, "settings": dict, "environment": str, "configuration": dict, "card": dict,
                   "versions": dict}  # fmt: skip
 ABOUT = "about"  # the array with the JSON, as bytes
@@ -32,7 +32,7 @@ AN_AGENT = "the .npz that drive-agent train writes, or the name of an agent that
 
 
 class BundleError(ValueError):
-    """A file is not a bundle, is damaged, or would not be one; the message gives the mistake and the remedy."""
+    """A file is not a valid bundle, or would not be one; the message gives the mistake and the remedy."""
 
 
 @dataclass(frozen=True)
@@ -40,13 +40,13 @@ class AgentFile:
     """A trained agent as data.
 
     Attributes:
-        kind: How arrays and settings become something that acts: a row of `policy.KINDS`.
+        kind: Type of the policy: a row of `policy.KINDS`.
         arrays: Numbers by name, e.g. weights and normaliser.
-        settings: What the kind needs besides, as JSON has it.
+        settings: Further data of the kind, in the form of JSON.
         environment: Name of the environment that it was trained in, e.g. "ServoDrive/Tracking-v0".
-        configuration: The environment's options that observations and actions depend on, as JSON has them.
-        card: How it was trained, on what distribution, with which seeds, what it reaches, and its limits.
-        versions: Package -> version, of those that made it.
+        configuration: The environment's options that observations and actions depend on, in the form of JSON.
+        card: How it was trained, on what distribution, with which seeds, its scores, and its limits.
+        versions: Package -> version at its creation.
     """
 
     kind: str
@@ -80,9 +80,9 @@ class AgentFile:
         """Write the bundle; equal bundles make equal files.
 
         Raises:
-            BundleError: If it would be larger than MAX_BYTES, or its tables hold what JSON cannot.
+            BundleError: If it would be larger than MAX_BYTES, or its tables have values that JSON lacks.
         """
-        from drive_env.whole_file import write_whole  # who acts by an agent needs NumPy alone
+        from drive_env.whole_file import write_whole  # imported here: acting with an agent needs only NumPy
 
         path = Path(path)
         about = _canonical({**self._about(), "hash": self.hash}).encode()
@@ -129,7 +129,7 @@ class AgentFile:
         bundle = cls(arrays=arrays, **{name: about[name] for name in KINDS_OF_ABOUT})
         if bundle.hash != about.get("hash"):
             raise BundleError(f"{path} was changed after it was written: its hash is {bundle.hash[:12]}…; get it again")
-        # Of a load of its own the copy beside it, never a file of that name where it is run.
+        # For a load by path the copy beside the bundle, never a file of that name in the present folder.
         kept = found_again(bundle.configuration, bundle.card.get("inputs"), path.parent, alone=True)
         return replace(bundle, configuration=kept)
 

@@ -1,8 +1,8 @@
 """Baselines that an agent must beat, as policies, by name: `drive-agent evaluate feed_forward --environment tracking`.
 
-`nothing` is the drive's own cascade, or the baseline rule's gains; `surrogate` is the tuner that ships. The others are
-feed-forward as one identifies it: the constants below gave the least mean following error over 64 machines drawn from
-the load's distribution.
+`nothing` is the drive's own cascade, or the baseline rule's gains; `surrogate` is the shipped tuner. The others are
+identified feed-forward: the constants below gave the least mean following error over 64 machines drawn from the load's
+distribution.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from mechanics.arrays import Singles
 
 AXIS_ENTRIES = 8  # of an axis in Tracking's observation
 ERROR, SPEED, SPEED_LATER = 0, 5, 6
-PREVIEW = 0.01  # s, how much later
+PREVIEW = 0.01  # s, time until the later reference
 # The commissioned cascade's lag behind its reference: times velocity [s], about 1/k_v, and times acceleration [s^2], of
 # the velocity loop and the bus.
 LAG = (0.030, 3e-4)
-LAGS = {"gantry": (0.032, 4e-4)}  # of loads that have another
+LAGS = {"gantry": (0.032, 4e-4)}  # of loads with another lag
 GAIN = 60.0  # 1/s, k_v of a position loop in the master
 ACCELERATION_TIME = 0.010  # s, the lag of the commissioned velocity loop
 # Entry of Tracking's observation of inverted_pendulum -> weight: position, velocity, angle and its rate. Found by the
@@ -42,7 +42,7 @@ BALANCE = {2: 0.44, 3: 0.57, 8: 5.3, 9: 0.33}
 
 
 def nothing(axes: int) -> Any:
-    """Return the policy of so many actions that adds nothing."""
+    """Return the policy whose actions are 0."""
     return ControlLaw(lambda rows: np.zeros((len(rows), axes)))
 
 
@@ -63,7 +63,7 @@ class ControlLaw:
 
 
 def state_feedback(configuration: Any) -> ControlLaw:
-    """Return the law that holds the inverted pendulum through cst: BALANCE on its state."""
+    """Return the control law that balances the inverted pendulum in cst: BALANCE times its state."""
     if configuration.load != "inverted_pendulum" or configuration.mode != "cst" or configuration.action != "direct":
         raise ValueError(
             "the baseline state_feedback is for load inverted_pendulum, mode cst and action direct alone; here they "
@@ -78,8 +78,8 @@ def feed_forward(configuration: Any, lags: Any = None) -> ControlLaw:
     """Return the identified feed-forward for a configuration of Tracking whose action is the offset.
 
     csp: 60B0h leads by the lags, those of the load or given ones, each a number or of shape (environments, axes). csv:
-    a position loop in the master, and through 60B1h the velocity that the acceleration needs besides. Of cst it is
-    nothing: its profile is the current already.
+    a position loop in the master, and 60B1h adds the velocity for the acceleration. In cst it is 0: the profile already
+    is the current.
     """
     mode, offset = configuration.mode, configuration.offset
     if configuration.action != "offset":
@@ -127,7 +127,7 @@ def surrogate(configuration: Any) -> Any:
     return policy_of(replace(bundle, settings={**bundle.settings, "step": configuration.step}))
 
 
-# Environment -> name of a baseline -> what makes it from configuration and number of actions.
+# Environment -> name of a baseline -> function that makes it from configuration and number of actions.
 BASELINES: dict[str, dict[str, Any]] = {
     "ServoDrive/GainTuning-v0": {
         "nothing": lambda configuration, actions: nothing(actions),
@@ -142,9 +142,9 @@ BASELINES: dict[str, dict[str, Any]] = {
 }
 
 
-# Task of the suite -> name of a baseline -> what makes it. A baseline that cannot act has no row: the set-points
-# of a drive that follows a profile cannot be held at rest by an offset, and no cascade balances a pole. In a tuning the
-# cascade is as the drive is commissioned.
+# Task of the suite -> name of a baseline -> function that makes it. A baseline that cannot act has no row: a drive that
+# follows a profile cannot be held at rest by an offset, and no cascade balances a pole. In a tuning the cascade is that
+# of the commissioned drive.
 SUITE_TASKS: dict[str, dict[str, Any]] = {
     "ServoDrive/TorqueTracking-v1": {"rest": nothing, "cascade": TorqueCascade, "expert": ComputedTorque},
     "ServoDrive/GantryBeam-v1": {"cascade": nothing, "expert": LeadAndFeedback},
@@ -175,7 +175,7 @@ def baseline(name: str, environment: str, configuration: Any, actions: int) -> A
     """Return a baseline of an environment by name.
 
     Raises:
-        ValueError: If it has none of that name.
+        ValueError: If it has no baseline of that name.
     """
     rows = baselines_of(environment)
     if name not in rows:

@@ -1,8 +1,8 @@
-"""Calls that are waited for no longer than a deadline: a policy is anybody's code, and may never come back.
+"""Calls with a deadline: a policy is foreign code, and may never return.
 
-Each call is made in a thread of its own, so that the one that acts on drives goes on whatever the other does: it
-computes for ever, waits for what never comes, or sleeps. What holds the interpreter's lock all the while (a compiled
-extension can) stops this process altogether; the drives then miss its heartbeat and stop by themselves.
+Calls are made in a separate thread, so that the thread that acts on drives continues even if a call computes, waits or
+sleeps for ever. Code that holds the interpreter's lock all the time (a compiled extension can) stops the whole process;
+the drives then miss its heartbeat and stop by themselves.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from drive_env.realtime_section import SWITCH_INTERVAL
 
 
 class DeadlineError(TimeoutError):
-    """A call did not come back in time."""
+    """A call did not return in time."""
 
 
 class Deadline:
-    """Makes calls one after the other in one thread; one that is late is given up, and with it the thread."""
+    """Makes calls one after the other in one thread; a late one is abandoned together with the thread."""
 
     def __init__(self) -> None:
         self._calls: queue.SimpleQueue[Any] = queue.SimpleQueue()
@@ -35,15 +35,15 @@ class Deadline:
         """Call a function in the thread; return its result, or raise its exception.
 
         Args:
-            function: What is called.
-            arguments: With what.
-            within: How long it may take [s].
+            function: The function.
+            arguments: Its arguments.
+            within: Longest duration [s].
 
         Raises:
-            DeadlineError: If it has not come back by then; the next call begins a new thread.
+            DeadlineError: If it has not returned by then; the next call begins a new thread.
         """
         if self._thread is None:
-            context = contextvars.copy_context()  # NumPy's error handling, for one, is as it is here
+            context = contextvars.copy_context()  # keeps, for example, NumPy's error handling
             run = (_serve, self._calls, self._ends)
             self._thread = threading.Thread(target=context.run, args=run, name="policy", daemon=True)
             self._thread.start()
@@ -53,7 +53,7 @@ class Deadline:
         except queue.Empty:
             self._give_up()
             raise DeadlineError(f"no answer within {within:g} s") from None
-        except BaseException:  # Ctrl-C while it is waited for
+        except BaseException:  # Ctrl-C during the wait
             self._give_up()
             raise
         if error is not None:
@@ -71,22 +71,22 @@ class Deadline:
         self._calls.put(None)
 
     def _give_up(self) -> None:
-        """Leave the thread behind: its answer is dropped, and if it runs Python, it is ended there."""
+        """Abandon the thread: its answer is dropped, and if it runs Python code, it is ended."""
         thread, self._thread = self._thread, None
         self._calls.put(None)
         self._calls, self._ends = queue.SimpleQueue(), queue.SimpleQueue()
-        # It may compute on, and would keep the interpreter for 5 ms at a time while the drives are being stopped.
+        # It might compute on, and hold the interpreter for 5 ms at a time while the drives are being stopped.
         sys.setswitchinterval(min(sys.getswitchinterval(), SWITCH_INTERVAL))
         if thread is not None and thread.ident is not None:
-            with contextlib.suppress(Exception):  # of CPython alone
+            with contextlib.suppress(Exception):  # only on CPython
                 ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread.ident), ctypes.py_object(SystemExit))
 
 
 def _serve(calls: queue.SimpleQueue[Any], ends: queue.SimpleQueue[Any]) -> None:
-    with contextlib.suppress(SystemExit):  # of a thread that was given up, wherever it is by now
+    with contextlib.suppress(SystemExit):  # of an abandoned thread, at any point
         while (call := calls.get()) is not None:
             function, arguments = call
             try:
                 ends.put((None, function(*arguments)))
-            except BaseException as error:  # the caller's, whatever it is
+            except BaseException as error:  # passed to the caller, of any type
                 ends.put((error, None))

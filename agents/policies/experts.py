@@ -1,7 +1,7 @@
-"""Experts of the suite's tasks: the program of a motion engineer, given the machine as an identification has it.
+"""Experts of the suite's tasks: the program of a motion engineer who has identified the machine.
 
-An expert knows the parameters of each machine when its episode begins (`told`); where none are known, on a bus, it
-takes the nominal ones. What it must cope with all the same: delays of the bus, flexibility, sensors.
+An expert knows the parameters of each machine when its episode begins (`told`); on a bus, where they are
+unknown, it uses the nominal ones. Delays of the bus, flexibility and sensors still disturb it.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Expert:
     """Base of the experts.
 
     Args:
-        configuration: Of the environment.
+        configuration: The environment's configuration.
     """
 
     def __init__(self, configuration: Any) -> None:
@@ -40,11 +40,11 @@ class Expert:
         self._machine: dict[str, Floats] = {}
 
     def told(self, parameters: Mapping[str, Floats], mask: Any) -> None:
-        """Take the parameters of machines that begin, or whose payload has changed, where the mask is true.
+        """Store the parameters of starting machines, or of those whose payload has changed, where the mask is true.
 
         Args:
             parameters: By name, (environments,) each.
-            mask: Which, (environments,).
+            mask: The machines, (environments,).
         """
         for name, values in parameters.items():
             kept = self._machine.setdefault(name, np.array(values, float))
@@ -52,7 +52,7 @@ class Expert:
         self.reset(mask)
 
     def parameter(self, name: str, nominal: float) -> Floats:
-        """Return a parameter of all machines; where it was not told, the nominal one."""
+        """Return a parameter of all machines; the nominal one if it is unknown."""
         return np.asarray(self._machine.get(name, nominal), float)
 
     def reset(self, mask: Any = None) -> None:
@@ -170,8 +170,8 @@ class SwingUp(Pendulum):
 class LeadAndFeedback(Expert):
     """Set-points that lead by the cascade's lags, and by a share of the following error besides, of axes in csp.
 
-    Feed-forward of velocity and acceleration (Lambrechts et al. 2005); its two lags were found by trying, the same for
-    every machine. The feedback is what keeps Ms below 2.5 on all machines (`drive-agent margins expert`).
+    Feed-forward of velocity and acceleration (Lambrechts et al. 2005); its two lags were found by trial, the same for
+    every machine. The feedback is chosen so that Ms stays below 2.5 on all machines (`drive-agent margins expert`).
     """
 
     LAG, LAG_OF_SPEED = 0.0315, 4e-4  # s, s^2
@@ -321,7 +321,7 @@ class MarginDesign(Expert):
             model.set_machines(self._machine, np.full(count, supply))
 
             def worth(sets: Floats, nominal: bool) -> Floats:
-                """Return how fast sets of gains are, (sets, environments, 3); of those that break the margins less."""
+                """Score sets of gains, (sets, environments, 3), by speed, or slack - 1e9 outside the margins."""
                 raw = [device.gains.changed(rule, one, columns, device.gains.highest) for one in sets]
                 slack = np.array([model.loop_slack(one, nominal=nominal) for one in raw])
                 return np.where(slack > self.SLACK, sets @ self.SPEED, slack - 1e9)

@@ -1,8 +1,8 @@
-"""A watch over a policy that acts on drives: one that gives no number, sticks at its limit or stalls is stopped.
+"""A watch over a policy that acts on drives: it is stopped if it returns NaN, stays at its limit, or stalls.
 
-The safety envelope of a bus watches what the drives do; this watches what acts. A policy is asked in a thread of its
-own: when it has not answered in time it is given up, whether it is slow or never returns, and `stop` brings the drives
-to rest and leaves them disabled. The envelope's thread has quick-stopped them by then (`Limits(stall=...)`).
+The safety envelope of a bus monitors the drives; this monitors the policy. A policy is called in a separate thread: if
+it does not answer in time it is abandoned, whether it is slow or never returns, and `stop` brings the drives to rest
+and leaves them disabled. The envelope's thread has quick-stopped them by then (`Limits(stall=...)`).
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from mechanics.arrays import Mask
 
 logger = logging.getLogger(__name__)
 
-AT_LIMIT = 0.999  # of the action's range: it cannot ask for more
+AT_LIMIT = 0.999  # of the action's range, above which it counts as at the limit
 STOP_TIMEOUT, CYCLE = 2.0, 0.001  # s, for the ramp of a quick stop; a communication cycle
-# What an agent may change and what must not stay so, beside gains: offsets, profile velocity and mode.
+# Objects besides gains that an agent may change and that must be restored: offsets, profile velocity and mode.
 KEPT = (
     (cia402.POSITION_OFFSET, 0),
     (cia402.VELOCITY_OFFSET, 0),
@@ -36,7 +36,7 @@ KEPT = (
     (cia402.PROFILE_VELOCITY, 0),
     (cia402.MODE, 0),
 )
-AT_REST = 0.01  # of the speed at the begin of the ramp
+AT_REST = 0.01  # of the speed at the beginning of the ramp
 
 
 class PolicyStoppedError(PolicyError):
@@ -61,26 +61,26 @@ class GuardLimits:
                 raise ValueError(f"{name} must be above 0 s, not {value:g} s; None for no limit")
 
 
-# Limits on given drives, by environment. A trial's gains may well be at the end of their range, and between two trials
-# the axes hold their position: a second to think is what the envelope of a bus grants by itself.
+# Limits on given drives, by environment. A trial's gains may be at the end of their range, and between two trials the
+# axes hold their position: the envelope of a bus by itself allows a second.
 LIMITS = {
     "ServoDrive/Tracking-v0": GuardLimits(),
     "ServoDrive/GainScheduling-v0": GuardLimits(),
     "ServoDrive/GainTuning-v0": GuardLimits(saturation=None, stall=1.0),
 }
-# Where nothing is at stake but the user's patience: emulated machines, and a policy's first answer, for which it may
-# load and compile things.
+# For emulated machines, where only the user's patience is at stake, and for a policy's first answer, which may include
+# loading and compiling.
 PATIENT = GuardLimits(saturation=None, stall=60.0)
 
 
 class GuardedPolicy:
-    """A policy within limits; it acts as the policy it holds, in a thread of its own if `limits` have a stall time.
+    """A policy within limits; it acts as its policy, in a separate thread if `limits` have a stall time.
 
     Args:
-        policy: What acts.
+        policy: The policy.
         low, high: Ends of the action's range, shape (actions,).
         step: Time between two actions [s].
-        limits: What it may do.
+        limits: Its limits.
     """
 
     def __init__(self, policy: Any, low: ArrayLike, high: ArrayLike, step: float, limits: GuardLimits) -> None:
@@ -91,7 +91,7 @@ class GuardedPolicy:
         self._deadline = Deadline()
 
     def warm_up(self, observation: Any) -> None:
-        """Ask once and forget the answer, before anything moves: loading or compiling then is no stall.
+        """Call the policy once before anything moves, and drop its answer: loading or compiling is no stall then.
 
         Raises:
             PolicyStoppedError: If it does not answer within PATIENT.stall.
@@ -105,7 +105,7 @@ class GuardedPolicy:
         self._ask(self._policy.reset, mask, within=self._limits.stall)
 
     def told(self, parameters: Any, mask: Mask) -> None:
-        """Tell a policy that asks for it which machines begin."""
+        """Notify a policy that has `told` of the starting machines."""
         if parameters is not None and hasattr(self._policy, "told"):
             self._ask(lambda known: self._policy.told(known, mask), parameters, within=self._limits.stall)
 
@@ -124,7 +124,7 @@ class GuardedPolicy:
                 self._at_limit = np.zeros(there.shape, np.int64)
             self._at_limit = np.where(there, self._at_limit + 1, 0)
             longest = float(self._at_limit.max()) * self._step
-            # One action at its end is no sticking, however long the step.
+            # A single action at its end is allowed, however long the step.
             if longest >= saturation - 1e-9 and self._at_limit.max() > 1:
                 entry = int(np.argmax(self._at_limit.max(axis=0)))
                 raise PolicyStoppedError(
@@ -175,7 +175,7 @@ class GuardedPolicy:
                 return function(argument)
             start = time.perf_counter()
             answer = self._deadline.call(function, argument, within=within)
-            if time.perf_counter() - start >= within:  # this thread, too, may be late
+            if time.perf_counter() - start >= within:  # this thread may be late, too
                 raise DeadlineError
             return answer
         except DeadlineError:
@@ -185,7 +185,7 @@ class GuardedPolicy:
             ) from None
         except PolicyError as error:
             raise PolicyStoppedError(str(error)) from error
-        except Exception as error:  # anybody's code
+        except Exception as error:  # foreign code
             place = traceback.extract_tb(error.__traceback__)[-1]
             raise PolicyStoppedError(
                 f"the policy failed: {type(error).__name__}: {error} ({place.filename}, line {place.lineno})"
@@ -194,7 +194,7 @@ class GuardedPolicy:
 
 @contextmanager
 def unchanged(drives: Drives) -> Iterator[None]:
-    """Put gains, offsets, profile velocity and mode back as they were when the block ends; log failures."""
+    """Restore gains, offsets, profile velocity and mode when the block ends; log failures."""
     device = device_of(drives)
     kept = [name for name in KEPT if name in device.bindings]  # a stepper has no torque offset
     before = {name: drives.read(name) for name in (*device.gains.keys, *kept)}
@@ -202,7 +202,7 @@ def unchanged(drives: Drives) -> Iterator[None]:
         yield
     finally:
         for name, values in before.items():
-            for attempt in range(2):  # after a stall the envelope refuses one call, to tell of it
+            for attempt in range(2):  # after a stall the envelope refuses one call, to report it
                 try:
                     other = drives.read(name) != values
                     if other.any():
@@ -215,7 +215,7 @@ def unchanged(drives: Drives) -> Iterator[None]:
 
 @contextmanager
 def stopping(drives: Drives) -> Iterator[None]:
-    """Leave the drives at rest and disabled if the block ends with any exception, Ctrl-C too."""
+    """Leave the drives at rest and disabled if the block ends with any exception, also Ctrl-C."""
     try:
         yield
     except BaseException as error:
@@ -224,10 +224,10 @@ def stopping(drives: Drives) -> Iterator[None]:
 
 
 def stop(drives: Drives, reason: str) -> None:
-    """Bring drives to rest in a hurry and leave them disabled.
+    """Quick-stop drives and leave them disabled.
 
     Args:
-        drives: Emulated ones, or on a bus; there the envelope does it, which goes on where one of them does not answer.
+        drives: The drives; on a bus the envelope does it, and continues if one of them does not answer.
         reason: For the log.
     """
     envelope = drives.safety

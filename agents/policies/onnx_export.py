@@ -18,11 +18,11 @@ from agents.policies.agent_file import AgentFile, BundleError
 from drive_env.whole_file import write_whole
 from mechanics.arrays import Singles
 
-OPSET, IR_VERSION = 17, 8  # old enough for the runtimes of the last years
-TOLERANCE = 1e-5  # of an action's range: float32 adds up in another order there
+OPSET, IR_VERSION = 17, 8  # old enough for the runtimes of recent years
+TOLERANCE = 1e-5  # of an action's range: float32 is summed in another order there
 METADATA = "drive_agent"
 
-# Activation -> its ONNX operator; None where it takes several.
+# Activation -> its ONNX operator; None if it takes several.
 _OPERATORS = {"tanh": "Tanh", "relu": "Relu", "elu": "Elu", "leaky_relu": "LeakyRelu", "silu": None}
 
 
@@ -54,7 +54,7 @@ def to_onnx(bundle: AgentFile) -> Any:
     """Return the ONNX model of a bundle.
 
     Raises:
-        BundleError: For a kind that has no such form.
+        BundleError: For a kind that cannot be exported.
     """
     from onnx import checker, helper
 
@@ -120,7 +120,7 @@ def compare(bundle: AgentFile, path: str | Path, act: Callable[[Any], Any] | Non
 
 
 def trial_observations(bundle: AgentFile, steps: int = 200) -> Singles:
-    """Return observations as a training had them and far beyond, shape (steps, 16, entries)."""
+    """Return observations in the range of a training and far beyond, shape (steps, 16, entries)."""
     mean, scale = bundle.arrays["observation_mean"], bundle.arrays["observation_scale"]
     rng = np.random.default_rng(0)
     spread = np.exp(rng.uniform(np.log(0.1), np.log(20.0), (steps, 16, 1)))
@@ -132,7 +132,7 @@ def _enter(graph: Graph, bundle: AgentFile) -> str:
     clip = bundle.settings.get("observation_clip")
     if clip is None:
         return "observation"
-    # In doubles, as NumPy does it: a mean far from 0 would else cost digits.
+    # In doubles, as NumPy does: otherwise a mean far from 0 would cost digits.
     x = graph.add("Cast", "observation", to=11)
     x = graph.add("Sub", x, graph.constant(bundle.arrays["observation_mean"], np.float64))
     x = graph.add("Mul", x, graph.constant(bundle.arrays["observation_scale"], np.float64))
@@ -186,7 +186,7 @@ def _lstm(graph: Graph, bundle: AgentFile, x: str) -> tuple[str, list[Any], list
     )
 
 
-# Kind of a bundle -> what builds its network; inputs and outputs besides observation and action.
+# Kind of a bundle -> builder of its network; inputs and outputs besides observation and action.
 _BODIES: dict[str, Callable[[Graph, AgentFile, str], tuple[str, list[Any], list[Any]]]] = {"mlp": _mlp, "lstm": _lstm}
 
 

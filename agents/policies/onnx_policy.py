@@ -16,21 +16,21 @@ from mechanics.reading.limited_child import call_limited
 from mechanics.reading.untrusted import parse_json, read_bytes
 
 METADATA = "drive_agent"
-MOST_BYTES = 100_000_000  # of a file: far more than any policy that makes its millisecond
-ACTION_TIME, ACTION_MEMORY = 20.0, 2_000_000_000  # s of the processor and bytes for loading it and one action
+MOST_BYTES = 100_000_000  # of a file: far more than a policy that computes within a millisecond
+ACTION_TIME, ACTION_MEMORY = 20.0, 2_000_000_000  # processor time [s] and bytes for loading it and one action
 CARRIED = {"state": "next_state", "cell": "next_cell"}  # of recurrent agents
 
 
 class OnnxPolicy:
     """A policy of one thread from an ONNX file.
 
-    A file of a few bytes may ask for 10^11 numbers or 10^15 rounds of a loop: another process acts once beforehand.
+    A file of a few bytes may demand 10^11 numbers or 10^15 rounds of a loop: another process first acts once.
 
     Args:
         path: The file.
 
     Raises:
-        BundleError: If it is no model, has other inputs, one action exceeds a limit, or onnxruntime is missing.
+        BundleError: If it is not a model, has other inputs, one action exceeds a limit, or onnxruntime is missing.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -116,7 +116,7 @@ def _act_once(path: Path) -> bytes:
             for one in session.get_inputs()}  # fmt: skip
     try:
         session.run(None, rows)
-    except Exception as error:  # whatever it does not take it says when it is used
+    except Exception as error:  # unsupported content is reported when it is used
         if "alloc" in str(error):
             raise MemoryError from None
     return b""
@@ -129,5 +129,5 @@ def _session(path: str | Path) -> Any:
     options.intra_op_num_threads = options.inter_op_num_threads = 1  # threads cost more than such a network
     try:
         return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # onnxruntime raises what its own library defines
+    except Exception as error:  # onnxruntime raises exceptions of its own library
         raise BundleError(f"{path} is not an ONNX model: {str(error).splitlines()[0]}") from None

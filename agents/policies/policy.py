@@ -1,4 +1,4 @@
-"""Acting with a bundle, by NumPy alone: for a controller on a small computer, without torch, Gymnasium or MuJoCo.
+"""Acting with a bundle, only with NumPy: for a controller on a small computer, without torch, Gymnasium or MuJoCo.
 
 `load_policy("agent.npz").act(observation)` takes observations of shape (entries,) or (environments, entries).
 """
@@ -17,9 +17,9 @@ from numpy.typing import ArrayLike
 from agents.policies.agent_file import AgentFile, BundleError
 from mechanics.arrays import Mask, Singles
 
-ACTOR = "observation"  # the entry of a dict observation that the actor sees
+ACTOR = "observation"  # the actor's entry of a dict observation
 
-# Kind of a bundle -> what is made of one: a class or function that takes it. Another kind of agent is another row.
+# Kind of a bundle -> class or function that makes its policy.
 KINDS: dict[str, str] = {
     "mlp": "agents.policies.policy:MlpPolicy",
     "lstm": "agents.policies.policy:LstmPolicy",
@@ -83,7 +83,7 @@ def _squash(x: Singles, low: Singles, high: Singles) -> Singles:
     return np.asarray(low + np.float32(0.5) * (np.tanh(x) + np.float32(1.0)) * (high - low), np.float32)
 
 
-# How a network's output becomes an action: cut off at the space's bounds (PPO), or squashed into them (SAC).
+# Conversion of a network's output to an action: limited to the space's bounds (PPO), or squashed into them (SAC).
 OUTPUTS: dict[str, Callable[[Singles, Singles, Singles], Singles]] = {"clip": _clip, "tanh": _squash}
 
 
@@ -91,7 +91,7 @@ class Ends:
     """Common first and last steps of all networks: checks, normaliser, action bounds.
 
     Arrays: observation_mean, observation_scale (1/standard deviation), shape (entries,); action_low, action_high, shape
-    (actions,). Settings: observation_clip (of the normalised observation; None for no normaliser), output (OUTPUTS).
+    (actions,). Settings: observation_clip (of the normalised observation; None: no normaliser), output (OUTPUTS).
     """
 
     def __init__(self, bundle: AgentFile) -> None:
@@ -212,7 +212,7 @@ class LstmPolicy(MlpPolicy):
     def reset(self, mask: Mask | None = None) -> None:
         """Reset the state, in all environments or where the mask is true."""
         keep = np.zeros(len(self._state), bool) if mask is None else ~np.asarray(mask, bool)
-        if len(keep) != len(self._state):  # of an earlier number of environments
+        if len(keep) != len(self._state):  # from another number of environments
             keep = np.zeros(len(self._state), bool)
         self._state, self._cell = (np.where(keep[:, None], x, np.float32(0.0)) for x in (self._state, self._cell))
 
@@ -230,11 +230,11 @@ class Latency(NamedTuple):
 
 
 def measure_latency(act: Callable[[Singles], Any], entries: int, calls: int = 2000) -> Latency:
-    """Return how long a policy takes for one observation of so many entries, on this computer as it is now."""
+    """Return the time of a policy for one observation of `entries` numbers, on this computer in its present state."""
     rng = np.random.default_rng(0)
     observations = rng.uniform(-1.0, 1.0, (64, entries)).astype(np.float32)
     times = np.empty(calls)
-    for k in range(-min(calls, 50), calls):  # some first, unmeasured: caches fill
+    for k in range(-min(calls, 50), calls):  # some unmeasured calls first: caches fill
         start = time.perf_counter()
         act(observations[k % 64])
         times[max(k, 0)] = time.perf_counter() - start

@@ -1,20 +1,20 @@
-"""The agents that ship in the package, by name; each has its card inside (`drive-agent evaluate --card NAME`)."""
+"""The shipped agents, by name; each contains its card (`drive-agent evaluate --card NAME`)."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 FOLDER = Path(__file__).parent
-TUNER = "gain_tuning"  # what `drive-tune auto --by agent` takes unless told otherwise
+TUNER = "gain_tuning"  # default agent of `drive-tune auto --by agent`
 
 
 def shipped_names() -> tuple[str, ...]:
-    """Return the names of all agents that ship."""
+    """Return the names of all shipped agents."""
     return tuple(sorted(path.stem for path in FOLDER.glob("*.npz")))
 
 
 def shipped(name: str) -> Path:
-    """Return the file of an agent that ships.
+    """Return the file of a shipped agent.
 
     Raises:
         ValueError: For an unknown name.
@@ -25,6 +25,6 @@ def shipped(name: str) -> Path:
 
 
 def find_agent(name_or_path: str) -> Path:
-    """Return the file of an agent: one that ships, by its name, or any other."""
+    """Return the file of an agent: a shipped one by its name, or any other."""
     path = Path(name_or_path)
     return path if path.suffix == ".npz" or path.exists() else shipped(name_or_path)

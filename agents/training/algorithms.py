@@ -1,4 +1,4 @@
-"""The algorithms of Stable-Baselines3 and its contributions that agents are trained with."""
+"""The algorithms of Stable-Baselines3 and sb3-contrib for training agents."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ ALGORITHMS = {
     "tqc": "sb3_contrib:TQC",
     "crossq": "sb3_contrib:CrossQ",
 }
-# Algorithm -> the one whose hyper-parameters it takes: TQC is SAC with critics of quantiles (arXiv:2005.04269), CrossQ
-# SAC with normalised layers in place of target networks (arXiv:1902.05605).
+# Algorithm -> the algorithm whose hyper-parameters it shares: TQC is SAC with critics of quantiles (arXiv:2005.04269),
+# CrossQ is SAC with normalised layers instead of target networks (arXiv:1902.05605).
 SAME_HYPERPARAMETERS = {"tqc": "sac", "crossq": "sac"}
-# Algorithm -> hyper-parameters of those that it has no use for.
+# Algorithm -> shared hyper-parameters that it does not have.
 NOT_TAKEN = {"crossq": ("tau",)}
 
 

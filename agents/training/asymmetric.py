@@ -1,7 +1,7 @@
-"""A critic that sees more than the actor: the true machine, which an emulator knows and a drive does not.
+"""A critic that sees more than the actor: the true machine, which only an emulator knows.
 
 For environments with `privileged: true`, whose observation is a dict of "observation" and "privileged". The actor's
-network ends up in a bundle as any other; the critic's, and what it saw, stays behind.
+network is exported to a bundle; the critic's network and its entries are not.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from agents.policies.policy import ACTOR
 
 
 class _Split(nn.Module):  # type: ignore[misc]
-    """Two networks on the entries of a dict in a row: the actor's on the first of them, the critic's on all."""
+    """Two networks on the concatenated entries of a dict: the actor's on the first entries, the critic's on all."""
 
     def __init__(self, actor_entries: int, all_entries: int, net_arch: Any, activation_fn: Any) -> None:
         super().__init__()
         self._entries = actor_entries
-        # Of each MlpExtractor one half is used: the other must not be among the parameters.
+        # Of each MlpExtractor one half is used: the other one must not be among the parameters.
         actor = MlpExtractor(actor_entries, net_arch, activation_fn, device="cpu")
         critic = MlpExtractor(all_entries, net_arch, activation_fn, device="cpu")
         self.policy_net, self.value_net = actor.policy_net, critic.value_net

@@ -2,8 +2,9 @@
 
 SB3 saves networks, optimisers and counters. Added are `drive_agent.json` (the run), the normaliser, the replay buffer
 and the states of all random generators, so that the file alone can be resumed, exported and evaluated. Like every file
-of SB3 it holds pickles, and unpickling runs what its writer wished: it is loaded only with `trust`, also where a
-run goes on, since nothing in a folder proves who wrote it. What a file says of its run is JSON and needs none.
+of SB3 it contains pickles, and unpickling can run any code of its writer: it is loaded only with `trust`, even to
+resume a run, since nothing in a folder proves who wrote it. The file's description of its run is JSON and needs no
+trust.
 """
 
 from __future__ import annotations
@@ -26,9 +27,9 @@ from drive_env.whole_file import write_whole
 from mechanics.reading.untrusted import MOST_TEXT, member_names, parse_json, read_member
 
 MOST_UNPACKED = 16_000_000_000  # bytes of a replay buffer: a million observations of a thousand entries, twice
-# What the JSON of a run has besides: it is read before anybody is trusted.
+# Required keys of a run's JSON and their types; it is read before any trust is given.
 _OF_A_RUN = {"algorithm": str, "environment": str, "configuration": dict, "timesteps": int, "run": dict}
-PLAIN = "data"  # what a file of Stable-Baselines3 says of its model, as JSON with pickles in it
+PLAIN = "data"  # description of the model in a file of Stable-Baselines3: JSON with pickles in it
 RUN, NORMALISER, BUFFER, RANDOM = "drive_agent.json", "normaliser.pkl", "replay_buffer.pkl", "random_states.pkl"
 
 
@@ -41,7 +42,7 @@ class UntrustedError(CheckpointError):
 
 
 def save(path: Path, model: Any, normaliser: Any, run: dict[str, Any]) -> None:
-    """Write a checkpoint; the file is whole or not there."""
+    """Write a checkpoint; the file is complete or missing."""
     memory = io.BytesIO()
     model.save(memory)
     with zipfile.ZipFile(memory, "a", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
@@ -83,7 +84,7 @@ def check_trust(path: Path, trust: bool) -> None:
 
 
 def is_plain(path: Path) -> bool:
-    """Return whether a file is Stable-Baselines3's alone, without the parts of drive-agent."""
+    """Return whether a file is of Stable-Baselines3 itself, without the parts of drive-agent."""
     try:
         names = member_names(path)
     except (OSError, ValueError):
@@ -92,7 +93,7 @@ def is_plain(path: Path) -> bool:
 
 
 def load_plain(path: Path, *, trust: bool = False) -> Any:
-    """Return the model of a file of Stable-Baselines3's alone, whichever algorithm of its packages it is of.
+    """Return the model of a file of Stable-Baselines3 itself, of any algorithm of its packages.
 
     Raises:
         CheckpointError: If none of them has the policy's class; UntrustedError without `trust`; MissingPackageError
@@ -111,7 +112,7 @@ def load_plain(path: Path, *, trust: bool = False) -> Any:
             f"{path} has a policy of {module}, which no algorithm of Stable-Baselines3 has by itself; wrap it in a "
             "function and give that (module:function)"
         )
-    # Some share their policies: the one is meant of whose options the file tells most.
+    # Some share their policies: the one with most of the file's options is meant.
     kind = max(kinds, key=lambda one: len(set(inspect.signature(one).parameters) & set(said)))
     return kind.load(path, device="cpu")
 
@@ -130,8 +131,8 @@ def load(path: Path, env: Any = None, *, trust: bool = False) -> tuple[Any, Any]
 
     Args:
         path: The file.
-        env: The VecEnv without a normaliser, which is put around it.
-        trust: Its writer is trusted: what he put there is run.
+        env: The VecEnv, to which the normaliser is added; None for none.
+        trust: Whether its writer is trusted: their code is run.
 
     Raises:
         CheckpointError: If the file is not a checkpoint; UntrustedError without `trust`.
@@ -163,7 +164,7 @@ def random_states(model: Any) -> dict[str, Any]:
 
 
 def restore_random_states(path: Path, model: Any) -> None:
-    """Put the random generators back to where they were when a checkpoint that is trusted was written."""
+    """Restore the states of the random generators from a trusted checkpoint."""
     import torch
 
     states = pickle.loads(_read(path, RANDOM))

@@ -1,4 +1,4 @@
-"""Environments during a training: returns of episodes, reward terms, and the time that they took."""
+"""Environments during a training, with returns of episodes, reward terms, and their computing time."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ import numpy as np
 if TYPE_CHECKING:
     from drive_env.envs.vector_environment import VectorEnvironment
 
-EPISODES = 100  # the last ones, of which means are reported
+EPISODES = 100  # last episodes over which means are reported
 
 
 class CountedEnvironments:
-    """A vectorised environment that counts; it behaves as the one it holds.
+    """A vectorised environment with counters; otherwise it behaves as the environment inside.
 
     Attributes:
-        episodes: Ended since the beginning.
-        steps: Of all environments. seconds: Spent in the environment.
-        told: The info of the last reset or step, of all environments: Stable-Baselines3 gets none of it.
+        episodes: Number of finished episodes.
+        steps: Steps of all environments. seconds: Time spent in the environment.
+        told: The info of the last reset or step, of all environments: Stable-Baselines3 does not get it.
     """
 
     def __init__(self, vector: VectorEnvironment) -> None:
@@ -48,7 +48,7 @@ class CountedEnvironments:
         self.vector.stage = stage
 
     def reset(self, **options: Any) -> Any:
-        """Begin an episode in every environment; those that were under way do not count."""
+        """Begin an episode in every environment; interrupted ones do not count."""
         self._returns[:] = 0.0
         self._lengths[:] = 0
         start = time.perf_counter()
@@ -58,7 +58,7 @@ class CountedEnvironments:
         return found
 
     def step(self, actions: Any) -> Any:
-        """Act in every environment."""
+        """Make a step in every environment."""
         start = time.perf_counter()
         stepped = self.vector.step(actions)
         self.seconds += time.perf_counter() - start
@@ -87,7 +87,7 @@ class CountedEnvironments:
         return found
 
     def forget(self) -> None:
-        """Begin the means of episodes and terms anew."""
+        """Restart the means of episodes and terms."""
         self._ended.clear()
         self.take_terms()
 

@@ -1,7 +1,7 @@
-"""A policy that begins as a teacher: before PPO improves it, its network learns the teacher's actions.
+"""Imitation of a teacher: before PPO improves a policy, its network learns the teacher's actions.
 
-The teacher acts with the exploration noise that PPO will begin with, so that the critic learns the returns of that,
-too: an untaught critic's first updates would undo what was imitated.
+The teacher acts with PPO's initial exploration noise, so that the critic learns the returns of noisy actions, too: the
+first updates by an untrained critic would undo the imitation.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from agents.policies.policy import ACTOR
 
 STEPS = 60_000  # of all environments together
 BATCH, UPDATES, LEARNING_RATE = 1024, 1200, 1e-3
-PLAYING = 0.9  # of the time, about
+PLAYING = 0.9  # share of the time for playing, about
 
 
 def imitate(
@@ -31,15 +31,15 @@ def imitate(
 ) -> float:
     """Teach a model of PPO and return the RMS difference of its actions from the teacher's.
 
-    A critic that sees more than the actor learns from all of it; the teacher sees what the actor does.
+    A critic that sees more than the actor learns from all its entries; the teacher sees the actor's.
 
     Args:
-        model: With its environment, the normaliser included, which learns its statistics here.
-        teacher: What acts on the environment's own observations: `act(observations)`, `reset(mask)`.
-        seed: Of the environments and of the noise.
-        steps: Of all environments together.
-        updates: Of the network.
-        told: Called with the share that is done, 0...1.
+        model: The model with its environment; the normaliser learns its statistics here.
+        teacher: The teacher, which acts on the environment's own observations: `act(observations)`, `reset(mask)`.
+        seed: Seed of the environments and of the noise.
+        steps: Steps of all environments together.
+        updates: Updates of the network.
+        told: Called with the finished share, 0...1.
     """
     import torch
 
@@ -126,9 +126,9 @@ def _play(
 
 
 def _tell(teacher: Any, env: Any, mask: Any) -> None:
-    """Tell a teacher that wants it the machines whose episodes begin where the mask is true.
+    """Notify a teacher that has `told` of the machines whose episodes begin where the mask is true.
 
-    The network, which is told nothing, learns what such a teacher does on average over the machines.
+    The network, without this knowledge, learns such a teacher's average action over the machines.
     """
     if hasattr(teacher, "told"):
         teacher.told(env.get_attr("told")[0]["parameters"], mask)

@@ -1,4 +1,4 @@
-"""The picture of a training: the returns of its episodes, and the terms of its reward, over the steps."""
+"""The plot of a training: the returns of its episodes, and the terms of its reward, over the steps."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from pathlib import Path
 from drive_env.whole_file import write_picture
 from mechanics.reading.untrusted import MOST_RECORDING, read_text
 
-TERM = "term "  # what columns of reward terms begin with
+TERM = "term "  # prefix of columns of reward terms
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#999999")
 
 
 def draw_learning_curve(table: Path, picture: Path, title: str) -> None:
-    """Draw training.csv as a PNG; nothing where the table has no rows yet.
+    """Draw training.csv as a PNG; no file if the table has no rows yet.
 
     Args:
         table: Rows of `timesteps`, `return` (mean of the last episodes) and terms of the reward, mean per step.
-        picture: The file, whole or as it was.
-        title: What was trained.
+        picture: The file, replaced only by a complete one.
+        title: Title of the plot.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -35,7 +35,7 @@ def draw_learning_curve(table: Path, picture: Path, title: str) -> None:
     figure = Figure(figsize=(8.0, 6.0 if terms else 3.5), layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplots(2 if terms else 1, 1, sharex=True, squeeze=False)[:, 0]
-    marker = "o" if len(rows) < 3 else None  # a line of one point is not seen
+    marker = "o" if len(rows) < 3 else None  # a line of one point is invisible
     panels[0].plot(steps, [_number(row.get("return")) for row in rows], color=COLORS[0], marker=marker)
     panels[0].set_ylabel("return of an episode, mean")
     panels[0].set_title(title, fontsize=10)

@@ -22,10 +22,10 @@ def bundle_of(
 
     Args:
         model: PPO, RecurrentPPO or SAC, or another of their form.
-        normaliser: Its VecNormalize; None for none.
+        normaliser: Its VecNormalize, or None.
         environment: Name of the environment.
         configuration: The environment's options.
-        card: What is to be known of it.
+        card: Its description.
 
     Raises:
         BundleError: For a network of another form.
@@ -90,9 +90,10 @@ def _layers(modules: list[Any]) -> tuple[str, list[Any]]:
 
 
 def _layer(layer: Any, before: Any) -> tuple[Any, Any]:
-    """Return weight and bias of a fully connected layer, which take in CrossQ's normalisation before it, if any.
+    """Return weight and bias of a fully connected layer, merged with CrossQ's normalisation before it, if any.
 
-    While an agent acts, that is (x - ra_mean) / sqrt(ra_var + eps) * scale + bias, with statistics that do not change.
+    For an acting agent this normalisation is (x - ra_mean) / sqrt(ra_var + eps) * scale + bias, with constant
+    statistics.
     """
     weight, bias = _array(layer.weight).T, _array(layer.bias)
     if before is None:

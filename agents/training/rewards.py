@@ -7,22 +7,21 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
-AXIS_ENTRIES = 8  # of an axis in Tracking's observation
+AXIS_ENTRIES = 8  # entries per axis in Tracking's observation
 ERROR, CURRENT, LAST_ACTION = 0, 4, 7
 
 
 class EachTrial(VecEnvWrapper):  # type: ignore[misc]
-    """A reward for GainTuning by each trial alone, whether it becomes the incumbent or not.
+    """A reward for each trial of GainTuning by itself, whether it becomes the incumbent or not.
 
-    It is - ln of the trial's robust cost over the rule's. The environment's own reward is 0 for every trial that is
-    not
-    better than all before, and a few machines of which the rule was far too cautious earn most of it: the policy that
-    it trained left half of the machines at the rule's gains. Meant for a discount of 0, since no trial is paid for what
-    others reach.
+    It is - ln of the trial's robust cost over the rule's. The environment's own reward is 0 for every trial that is not
+    better than all before, and most of it comes from a few machines for which the rule was far too cautious: a policy
+    trained with it left half of the machines at the rule's gains. Meant for a discount of 0, since no trial is rewarded
+    for others.
 
     Args:
-        venv: Of GainTuning, over `CountedEnvironments`.
-        limit: Of the reward, either way: what oscillates costs so much, and no machine counts for more.
+        venv: The VecEnv of GainTuning, over `CountedEnvironments`.
+        limit: Limit of the reward's magnitude: the cost of an oscillation, and the most that any machine counts.
     """
 
     def __init__(self, venv: Any, limit: float = 1.5) -> None:
@@ -37,12 +36,12 @@ class EachTrial(VecEnvWrapper):  # type: ignore[misc]
         return observation
 
     def step_wait(self) -> tuple[Any, Any, Any, Any]:
-        """Return the step with this reward in place of the environment's."""
+        """Return the step with this reward instead of the environment's."""
         observation, _, ended, infos = self.venv.step_wait()
         told = self._told()
         trial = told.get("final_info", told)["trial_robust_cost"]
         reward = np.clip(np.log(self._rule / trial), -self._limit, self._limit)
-        self._rule = np.where(ended, told["robust_cost"], self._rule)  # where an episode ended, another machine's
+        self._rule = np.where(ended, told["robust_cost"], self._rule)  # of another machine, if an episode ended
         return observation, reward.astype(np.float32), ended, infos
 
     def _told(self) -> Any:
@@ -50,14 +49,14 @@ class EachTrial(VecEnvWrapper):  # type: ignore[misc]
 
 
 class SmallErrors(VecEnvWrapper):  # type: ignore[misc]
-    """A reward for Tracking that still falls where the environment's own is flat: among errors of some thousandths.
+    """A reward for Tracking with a slope at errors of some thousandths, where the environment's own is flat.
 
     It is the mean over the axes of - |error| / 0.01 amplitude - effort (current / limit)^2 - smoothness (change of the
     action)^2.
 
     Args:
-        venv: Of Tracking.
-        error: Of the amplitude, which costs 1.
+        venv: The VecEnv of Tracking.
+        error: Error, as a share of the amplitude, that costs 1.
         effort, smoothness: Weights.
     """
 
@@ -73,7 +72,7 @@ class SmallErrors(VecEnvWrapper):  # type: ignore[misc]
         return observation
 
     def step_wait(self) -> tuple[Any, Any, Any, Any]:
-        """Return the step with this reward in place of the environment's, less 100 where a drive went into fault."""
+        """Return the step with this reward instead of the environment's, minus 100 if a drive went into fault."""
         observation, _, ended, infos = self.venv.step_wait()
         final = np.array(observation)
         tripped = np.zeros(self.num_envs)
@@ -93,13 +92,13 @@ class SmallErrors(VecEnvWrapper):  # type: ignore[misc]
 
 
 class Logarithm(VecEnvWrapper):  # type: ignore[misc]
-    """The logarithm of a reward in 0...1, in 0...1 again: of a task that pays next to nothing until an error is small.
+    """The logarithm of a reward, 0...1, scaled to 0...1: for a task with hardly any reward until an error is small.
 
     It is ln(1 + reward / least) / ln(1 + 1 / least), which grows as much from 0.01 to 0.1 as from 0.1 to 1.
 
     Args:
-        venv: Of a task of the suite.
-        least: Below it the reward is as good as 0.
+        venv: The VecEnv of a task of the suite.
+        least: Reward below which it counts as about 0.
     """
 
     def __init__(self, venv: Any, least: float = 0.001) -> None:
@@ -113,7 +112,7 @@ class Logarithm(VecEnvWrapper):  # type: ignore[misc]
         return self.venv.reset()
 
     def step_wait(self) -> tuple[Any, Any, Any, Any]:
-        """Return the step with this reward in place of the environment's."""
+        """Return the step with this reward instead of the environment's."""
         observation, reward, ended, infos = self.venv.step_wait()
         found = np.log1p(np.maximum(reward, 0.0) / self._least) / np.log1p(1.0 / self._least)
         return observation, found.astype(np.float32), ended, infos

@@ -1,4 +1,4 @@
-"""The callback by which Stable-Baselines3 trains in segments; it is imported where a training begins, as that is."""
+"""The callback for training with Stable-Baselines3 in segments; imported only when a training begins, like SB3."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ ROWS = 200  # of the table, about
 
 
 class Segments(BaseCallback):  # type: ignore[misc]
-    """Writes checkpoints, begins segments, tells how far it is."""
+    """Writes checkpoints, begins segments, reports progress."""
 
     def __init__(
         self,
@@ -63,7 +63,7 @@ class Segments(BaseCallback):  # type: ignore[misc]
         self._next_row = self.num_timesteps + self._row_length
         self._table = TrainingTable(self._folder / TABLE, keep=self.num_timesteps if self._resumed else 0)
         self._began = self._row_began = time.perf_counter()
-        # An imitation's steps and the first reset are no part of the training's speed.
+        # An imitation's steps and the first reset do not count for the training's speed.
         self._row_steps, self._row_seconds = self._lanes.steps, self._lanes.seconds
 
     def _on_rollout_start(self) -> None:
@@ -84,7 +84,7 @@ class Segments(BaseCallback):  # type: ignore[misc]
         return True
 
     def finish(self) -> None:
-        """Write the files of a run's end."""
+        """Write the final files of a run."""
         self._save()
         if self.num_timesteps and self._lanes.steps > self._row_steps:
             self._tell()

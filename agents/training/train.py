@@ -1,9 +1,9 @@
 """Training with Stable-Baselines3: one seed gives the same agent on the same machine, and a run can be resumed.
 
 A run is cut into segments, at whose ends a checkpoint is written and every environment begins a new episode with seeds
-of the segment. So a resumed run equals an uninterrupted one to the last digit: what cannot be saved, the emulated
-machines in the middle of their episodes, is begun anew in both. Not equal are times, and a run with other numbers of
-threads of torch, which may add up in another order.
+of the segment. So a resumed run equals an uninterrupted one to the last digit: the emulated machines in the middle of
+their episodes, which cannot be saved, are reset in both. Times differ, and so does a run with another number of torch
+threads, which may sum in another order.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ from tuning.runs.provenance import check_begun
 
 logger = logging.getLogger(__name__)
 
-# Torch's and NumPy's random numbers are a process's: of two trainings at once in it, none would be what it is alone.
+# Torch's and NumPy's random generators are global: two trainings at once in a process would disturb each other.
 _ALONE = threading.Lock()
-IMITATION = 1_000_000  # a segment's number that no run has, for seeds
-# "constant" is SB3's word for SAC's automatic entropy and others.
+IMITATION = 1_000_000  # number for the seeds of an imitation, beyond all segments
+# Options that may be schedules.
 _SCHEDULED = ("learning_rate", "clip_range", "clip_range_vf")
 # Keys whose value SB3 wants as a whole number, though YAML may say 1e5.
 _WHOLE = ("n_steps", "batch_size", "n_epochs", "buffer_size", "learning_starts", "train_freq", "gradient_steps")
@@ -58,18 +58,17 @@ def train(
     in inputs/ the files of its user that it needs.
 
     Args:
-        run: What is trained; with `resume` None of it is used but the folder's own.
-        folder: Where results go.
+        run: The run; not used with `resume`, which takes that of the folder.
+        folder: Folder of the results.
         report: Called with the progress, some 200 times.
-        resume: Go on from the folder's checkpoint.
-        trust: Its writer is trusted; needed to resume, see `agents.training.checkpoint`.
+        resume: Whether to continue from the folder's checkpoint.
+        trust: Whether its writer is trusted; needed to resume, see `agents.training.checkpoint`.
 
     Raises:
-        CheckpointError: If there is nothing to resume, or it is not trusted, or ValueError if it was begun with other
-            sources; MissingPackageError without the extra
-            `agents`.
+        CheckpointError: If there is nothing to resume, or it is not trusted, ValueError if it was begun with other
+            sources; MissingPackageError without the extra `agents`.
         HyperparameterError: For hyper-parameters that the algorithm does not take.
-        DivergedError: If the networks come to hold what nothing can act with; the last checkpoint is from before.
+        DivergedError: If the model is no longer sound (`is_sound`); the last checkpoint is from before.
     """
     folder = Path(folder)
     path = folder / CHECKPOINT
@@ -147,7 +146,7 @@ def _without_tracebacks_of_threads() -> Iterator[None]:
 
 
 def with_inputs(run: TrainingRun) -> TrainingRun:
-    """Return a run with the content of its user's files in place of the paths in its environment's options."""
+    """Return a run with the paths in its environment's options replaced by the content of the user's files."""
     given = run.hyperparameters
     options = taken_options(given.get("env_kwargs") or {})
     return replace(run, hyperparameters={**given, "env_kwargs": options}) if inputs_in(options) else run
@@ -311,7 +310,7 @@ def _settings_of(name: str) -> Iterator[None]:
 
 
 def _named(value: Any) -> tuple[str, dict[str, Any]]:
-    """Return name and settings of an entry that is a name, or a table of a name and its settings, as RL-Zoo has it."""
+    """Return name and settings of an entry in RL-Zoo's form: a name, or a table of a name and its settings."""
     if not isinstance(value, Mapping):
         return str(value), {}
     if len(value) != 1:

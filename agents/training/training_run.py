@@ -1,4 +1,4 @@
-"""A run of a training: its task, its files, its segments, and the report of its progress."""
+"""A training run: its task, files, segments, and progress report."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ class TrainingRun:
     Attributes:
         environment: Name of the environment.
         algorithm: A row of ALGORITHMS.
-        hyperparameters: As agents.training.hyperparameters.load returns them.
-        seed: Of all random numbers.
-        preset: Which preset the hyper-parameters came from, for the card.
-        segments: Checkpoints over the run, at whose ends the environments begin anew.
+        hyperparameters: Result of agents.training.hyperparameters.load.
+        seed: Seed of all random numbers.
+        preset: Preset of the hyper-parameters, for the card.
+        segments: Number of segments, each with a checkpoint at its end and then a reset of the environments.
         torch_threads: Threads of torch; small networks are fastest with 1.
     """
 
@@ -56,7 +56,7 @@ class TrainingRun:
 class Progress(NamedTuple):
     """The progress of a training: means of the last episodes and of each term per step; speed [steps/s]; time's shares.
 
-    `imitated` is the share of what comes before it, if the policy begins as a teacher: all else is 0 until that is 1.
+    `imitated` is the finished share of a preceding imitation: all else is 0 until it is 1.
     """
 
     timesteps: int

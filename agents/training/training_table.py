@@ -1,4 +1,4 @@
-"""The progress of a training: a CSV that is appended to, row by row, and cut where a run is resumed."""
+"""The progress of a training: a CSV that grows by rows, and is truncated when a run is resumed."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from mechanics.reading.untrusted import MOST_RECORDING, read_text
 
 
 class TrainingTable:
-    """Rows of a CSV; the first one says which columns there are.
+    """Rows of a CSV; the first one has the columns' names.
 
     Args:
-        path: The file; what it held goes, but rows up to `keep`.
-        keep: Steps up to which earlier rows stay: those of a run that is resumed.
+        path: The file; its content is deleted, except rows up to `keep`.
+        keep: Number of steps up to which a resumed run's rows are kept.
     """
 
     def __init__(self, path: Path, keep: int = 0) -> None:

@@ -1,4 +1,4 @@
-"""`drive-tune auto --by agent`: a trained agent tries gains on the axes, in the place of auto's own design."""
+"""`drive-tune auto --by agent`: a trained agent tries gains on the axes, instead of auto's own design."""
 
 from __future__ import annotations
 
@@ -33,15 +33,15 @@ def open_method(
     load: str | None,
     tell: Callable[[str], None],
 ) -> OpenedMethod:
-    """Return the method of an agent, that ships by default; arguments and errors as `tuning.commands.methods` has them.
+    """Return the method of an agent, by default the shipped one; arguments and errors as in `tuning.commands.methods`.
 
     Args:
-        agent: A name or a file; None for the one that ships.
+        agent: A name or a file; None for the shipped one.
         device: Name of the device, or its path.
-        trials: How many; None for the agent's own.
-        dynamics: What the loops must keep, as the user named it.
+        trials: Number of trials; None for the agent's own.
+        dynamics: Name of the required dynamics, as the user gave it; None for the agent's own.
         load: Name of an emulated machine's load; None on a bus.
-        tell: Called with a line for the user, as it goes on.
+        tell: Called with each line for the user.
     """
     name = agent or TUNER
     policy = open_tuner(name, device, trials, dynamics)

@@ -1,4 +1,4 @@
-"""Which gains keep the margins of the dynamics by the identified plant; computed, never learned."""
+"""The check of gains against the required margins on the identified plant; computed, never learned."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ if TYPE_CHECKING:
     from tuning.auto.stages import Basis
 
 
-# The least lowered ones first.
+# In the order of increasing reduction.
 NEAREST = LOWERED[np.abs(np.log(LOWERED)).sum(axis=1).argsort(kind="stable")]
 
 
 class KeptMargins(NamedTuple):
     """The loops of identified machines with any gains.
 
-    models: Loops of each machine, and which axes it has. dynamics: What they must keep. calm: Gains for where no
-    lowered ones keep it, raw, (num_axes, count).
+    models: Loops of each machine, and its axes. dynamics: The required dynamics. calm: Gains to use if no lowered ones
+    keep them, raw, (num_axes, count).
     """
 
     models: list[tuple[LoopModel, Integers]]
@@ -35,13 +35,13 @@ class KeptMargins(NamedTuple):
 
     @classmethod
     def of(cls, bench: AutoBench, basis: Basis) -> KeptMargins:
-        """Return those of the axes in a run, as they were identified."""
+        """Return the margins of a run's identified axes."""
         return cls(
             loop_models(bench.target, basis.identified, None, bench.going, bench.dynamics), bench.dynamics, basis.calm
         )
 
     def kept(self, gains: Integers) -> Mask:
-        """Return of which axes gains keep the dynamics, as far as the model may be off, (num_axes,).
+        """Return the axes whose gains keep the dynamics within the model's uncertainty, (num_axes,).
 
         Args:
             gains: Raw, (num_axes, count).
@@ -52,7 +52,7 @@ class KeptMargins(NamedTuple):
         return keep
 
     def lowered(self, gains: Integers) -> Integers:
-        """Return gains that keep the dynamics: those given, or the nearest with less velocity P and I and position P.
+        """Return gains that keep the dynamics: the given ones, or the nearest with less velocity P, I and position P.
 
         Args:
             gains: Raw, (num_axes, count).

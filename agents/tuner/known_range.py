@@ -1,4 +1,4 @@
-"""For which devices, motors, loads and machines a tuner's card holds, and the parts of a target outside."""
+"""The devices, motors, loads and machines that a tuner's card covers, and a target's parts outside."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ HOLDS = "holds for"  # on a card: a table of "devices", "motors" and "loads", na
 
 
 def outside(agent: AgentFile, target: Target, load: str | None) -> tuple[str, ...]:
-    """Return a sentence for each thing that a tuner was not trained on.
+    """Return a sentence for each part of a target that the tuner was not trained on.
 
     Args:
-        agent: The tuner's file. One whose card has no such table holds for what its configuration has.
+        agent: The tuner's file. A card without this table covers the file's configuration.
         target: The target to tune.
-        load: Name of the load; None where it is not known, as on a bus.
+        load: Name of the load; None if unknown, as on a bus.
     """
     holds = agent.card.get(HOLDS)
     if not isinstance(holds, Mapping):

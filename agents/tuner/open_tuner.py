@@ -1,4 +1,4 @@
-"""A trained tuner by its name or file, for a device; and its trials as lines for people."""
+"""A trained tuner by its name or file, for a device; and its trials as printed lines."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ ENVIRONMENT = "ServoDrive/GainTuning-v0"
 
 
 def open_tuner(agent: str, device: str, trials: int | None, dynamics: str | None = None) -> Any:
-    """Return the agent's policy, with so many trials and asked for dynamics if they are given.
+    """Return the agent's policy, with another number of trials or other dynamics if given.
 
     Raises:
-        ValueError: Unless it can tune the device, before anything moves.
+        ValueError: If it cannot tune the device; raised before anything moves.
     """
     if trials is not None and not 1 <= trials <= MOST_TRIALS:
         raise ValueError(f"--trials {trials} must be 1 or more, and {MOST_TRIALS} at most: each turns the motor")
@@ -41,7 +41,7 @@ def open_tuner(agent: str, device: str, trials: int | None, dynamics: str | None
 
 
 def titles_of_trials(known: GainSet) -> list[str]:
-    """Return the titles of the gains that a trial's line has."""
+    """Return the titles of the gains in a trial's line."""
     return [known.titles[k] for k in known.columns_of("velocity", "position")]
 
 

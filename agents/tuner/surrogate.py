@@ -1,17 +1,17 @@
 """A learnt tuner: a network predicts the robust cost of gains from all trials of the machine so far.
 
-It acts in `ServoDrive/GainTuning-v0`. Of every machine it keeps the context c (what was identified, what the trial at
-the rule's gains showed, and the Ms that the dynamics ask for) and its trials (log gains over the rule's x_i, what
-they showed y_i). A conditional neural process with attention (Kim et al., "Attentive Neural Processes", 2019), trained
-on emulated machines whose robust cost is known, predicts for any gains x its logarithm, as a Laplace distribution:
+It acts in `ServoDrive/GainTuning-v0`. For every machine it stores the context c (identified parameters, results of the
+trial at the rule's gains, and the dynamics' required Ms) and its trials (log gains over the rule's x_i, results y_i). A
+conditional neural process with attention (Kim et al., "Attentive Neural Processes", 2019), trained on emulated machines
+whose robust cost is known, predicts for any gains x its logarithm, as a Laplace distribution:
 
     v_i, p_i, k_i = trial(c, x_i, y_i)                      value, share of the summary, keys
     u   = silu(mean of p_i)                                 what kind of machine this is
     z_h = sum_i softmax_i(q_h(c, x) . k_ih - s_h |x - x_i|^2) v_i        what was seen near x, for each head h
     median, ln scale = worth(c, x, u, z)
 
-The next trial is the candidate with the least median less some of the scale. The answer is the trial, the rule's
-included, with the least median more some of the scale: what it showed itself and what the others did count.
+The next trial is the candidate with the least median minus a share of the scale. The answer is the trial, the rule's
+included, with the least median plus a share of the scale: its own results and those of the other trials count.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from mechanics.arrays import Floats, Mask, Singles
 
 # Of an axis's observation (the class docstring of GainTuning): what was identified, then gains, then two trials.
 IDENTIFIED, SHOWN = 4, 16
-STOPPED = (4, 9, 14)  # of what a trial showed: whether its move, its reversal, its probe was stopped
-ASKED = 1  # ln of the Ms of the dynamics
+STOPPED = (4, 9, 14)  # entries of a trial's results: whether its move, its reversal, its probe was stopped
+ASKED = 1  # entry with ln of the required Ms
 CONTEXT = IDENTIFIED + SHOWN + ASKED
 CLIP = 6.0  # of normalised inputs
-LEAST, MOST = -3.5, 1.0  # of ln of the scale
+LEAST, MOST = -3.5, 1.0  # limits of ln of the scale
 KEY = 12  # entries of a head's key
 WIDE, NEAR = 320, 96  # candidates all over the range, and around the best trial, then around the best candidate
 NEARNESS = (0.08, 0.25)  # standard deviations of the latter
@@ -50,9 +50,9 @@ def context_of(identified: Singles, shown: Singles, dynamics: Dynamics) -> Singl
     """Return the context of machines, (n, 21).
 
     Args:
-        identified: The observation's entries of what was identified, (n, 4).
-        shown: Those of what the rule's trial showed, (n, 16).
-        dynamics: What the loops must keep.
+        identified: The observation's entries of identified parameters, (n, 4).
+        shown: Its entries of the rule's trial, (n, 16).
+        dynamics: The required dynamics.
     """
     asked = np.full((len(shown), ASKED), np.log(dynamics.ms))
     return np.concatenate([identified, shown, asked], axis=1, dtype=np.float32)
@@ -68,7 +68,7 @@ class Normaliser(NamedTuple):
     gains_scale: Singles
 
     def context(self, raw: Singles) -> Singles:
-        """Return contexts as the networks take them."""
+        """Return contexts scaled for the networks."""
         return np.asarray(np.clip((raw - self.context_mean) * self.context_scale, -CLIP, CLIP))
 
     def shown(self, raw: Singles) -> Singles:
@@ -76,16 +76,16 @@ class Normaliser(NamedTuple):
         return np.asarray(np.clip((raw - self.shown_mean) * self.shown_scale, -CLIP, CLIP))
 
     def gains(self, raw: Singles) -> Singles:
-        """Return log gains over the rule's as the networks take them."""
+        """Return log gains over the rule's, scaled for the networks."""
         return raw * self.gains_scale
 
 
 class Memory(NamedTuple):
     """A network's memory of machines and their trials; heads come second.
 
-    shared: What every candidate's first layer gets alike, (machines, hidden). query: The context's part of queries,
+    shared: Equal input of every candidate's first layer, (machines, hidden). query: The context's part of queries,
     (machines, heads * KEY). gains: (machines, trials, gains). keys: (machines, heads, trials, KEY). values: (machines,
-    1, trials, value). hidden: What is no trial of the machine, (machines, 1, 1, trials).
+    1, trials, value). hidden: Entries without a trial, (machines, 1, 1, trials).
     """
 
     shared: Singles
@@ -144,8 +144,8 @@ class SurrogatePolicy:
     """Proposes gains for GainTuning, and answers: kind "surrogate" of a bundle.
 
     Arrays: those of NORMALISER, and those of WEIGHTS with the networks in the first dimension. Settings: gains (their
-    number), step (change of the log gains that an action of 1 makes), low, high (of what is tried, ln over the rule's,
-    for each gain), curiosity (of the scale, for trials), caution (of it, for the answer).
+    number), step (change of the log gains that an action of 1 makes), low, high (limits of trials, ln over the rule's,
+    for each gain), curiosity and caution (shares of the scale, for trials and for the answer).
     """
 
     def __init__(self, bundle: AgentFile) -> None:
@@ -162,7 +162,7 @@ class SurrogatePolicy:
         self._low, self._high = (np.asarray(s[end], np.float32) for end in ("low", "high"))
         self._curiosity, self._caution = float(s["curiosity"]), float(s["caution"])
         self._entries = IDENTIFIED + 2 * self._gains + 2 * SHOWN  # of an axis
-        rng = np.random.default_rng(0)  # the same candidates for ever: a run repeats
+        rng = np.random.default_rng(0)  # fixed candidates, so that runs are reproducible
         self._wide = rng.uniform(self._low, self._high, (WIDE, self._gains)).astype(np.float32)
         spread = np.repeat(NEARNESS, NEAR // len(NEARNESS))[:, None]
         self._near = (spread * rng.normal(0.0, 1.0, (NEAR, self._gains))).astype(np.float32)
@@ -193,8 +193,8 @@ class SurrogatePolicy:
     def answer(self, observation: ArrayLike) -> Floats:
         """Return the change of the log gains to the final choice, in steps: to a trial's gains, or the rule's.
 
-        All axes of an environment get the same trial: that whose worst axis is best, of those that were not stopped. It
-        is asked instead of `act`, with the observation after the last trial, and raises what that does.
+        All axes of an environment get the same trial: the one not stopped whose worst axis is best. Call it instead of
+        `act`, with the observation after the last trial; it raises the same errors.
         """
         _, incumbent = self._take(observation)
         median, scale = self._ask(self._read(), self._tried)
@@ -267,7 +267,7 @@ class SurrogatePolicy:
 
     def _leave(self, change: Singles, observation: ArrayLike) -> Floats:
         lanes = np.atleast_2d(observation)
-        # Not float32: times the step it is to be the change again, to the integer that was tried.
+        # Not float32: the division by the step and the later product must give the integer that was tried.
         action = np.clip(change.astype(float), -self._step, self._step).reshape(len(lanes), -1) / self._step
         found: Floats = action[0] if np.ndim(observation) == 1 else action
         return found

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 TRIAL_SECONDS = 0.75
 WIDEST = 10.4  # ln of the range of a gain
-PATIENCE = 2  # windows of 25 ms for which an axis may shake; what it does with the incumbent then decays or does not
+PATIENCE = 2  # windows of 25 ms for which an axis may oscillate; with the incumbent's gains it then decays or continues
 
 
 class TrialShown(NamedTuple):
@@ -39,7 +39,7 @@ class TrialShown(NamedTuple):
     aborted, better: Whether it was stopped; whether it became the incumbent, (num_machines,).
     faults: Names of emergencies, a tuple for each machine.
     kept: Whether the gains keep the margins by the identified plant, as far as it is known, (num_machines,).
-    lowered: Whether the policy proposed higher gains, which do not, (num_machines,).
+    lowered: Whether the policy proposed higher gains, which violate them, (num_machines,).
     """
 
     number: int
@@ -53,7 +53,7 @@ class TrialShown(NamedTuple):
 
     @property
     def good(self) -> Mask:
-        """Of which machines these gains can be the answer, (num_machines,)."""
+        """Return the machines whose answer these gains can be, (num_machines,)."""
         return ~self.aborted & self.kept
 
 
@@ -72,7 +72,7 @@ class Tuned(NamedTuple):
 
     @property
     def moves(self) -> int:
-        """How often each axis was moved."""
+        """Number of moves of each axis."""
         from tuning.search.trial_bench import MOVES_OF_IDENTIFICATION, MOVES_OF_TRIAL
 
         return MOVES_OF_IDENTIFICATION + MOVES_OF_TRIAL * len(self.trials)
@@ -91,18 +91,18 @@ def tune_target(
 
     Args:
         target: The drives; they may have any gains, also none.
-        policy: What proposes, with its `bundle` for the configuration.
+        policy: The policy that proposes gains, with its `bundle` for the configuration.
         show: Called after every trial.
-        trials: How many; the agent's own number by default.
-        calm: Gains for an axis that shakes on though its trial was stopped, (num_axes, count): the incumbent's, with
-            which it goes on, may be so near to the edge. By default those of the data sheet.
-        margins: What gains must keep: a proposal that does not is lowered before it is tried. By default nothing is
-            known of it.
+        trials: Number of trials; None for the agent's own number.
+        calm: Gains for an axis that oscillates even after its trial was stopped, (num_axes, count), since the
+            incumbent's may be close to instability, too. None: those of the data sheet.
+        margins: Margins for all gains: a proposal that violates them is lowered before it is tried. None: no margins
+            are known.
 
     Raises:
         ValueError: If the drive lacks a gain that the policy changes, or a rule for it.
-        PolicyStoppedError: If the policy gives no number, or no answer within the envelope's limit for a stall (on
-            emulated drives within `guard.PATIENT.stall`): the drives are at rest and disabled.
+        PolicyStoppedError: If the policy returns non-finite numbers, or no answer within the envelope's limit for a
+            stall (on emulated drives within `guard.PATIENT.stall`): the drives are at rest and disabled.
         RuntimeError: If a drive cannot be cleared any more.
     """
     from agents.policies.guard import GuardedPolicy, stopping
@@ -145,7 +145,7 @@ def _environment(target: Target, drives: Drives, trained: Mapping[str, Any], tri
         target: The target.
         drives: Its drives, watched.
         trained: The agent's configuration.
-        trials: How many instead of its own number.
+        trials: Number of trials; None for the agent's own.
     """
     from drive_env.drives.raw_gains import write_gains
     from drive_env.envs.gain_tuning import GainTuning
@@ -153,7 +153,7 @@ def _environment(target: Target, drives: Drives, trained: Mapping[str, Any], tri
 
     configuration = dict(trained) | ({} if trials is None else {"trials": trials})
     configuration["gains"] = gains_for(trained, target.device)
-    configuration["step"] = WIDEST  # lowered gains may lie farther from the incumbent than a policy may go
+    configuration["step"] = WIDEST  # lowered gains may be farther from the incumbent than a policy's steps
     write_gains(drives, first_gains(target))  # before anything is enabled: the drives may have any
     return GainTuning(
         target.num_axes // target.axes_per_machine,
@@ -176,9 +176,9 @@ def _make_trials(
 
     Args:
         env: The environment.
-        policy: What proposes.
+        policy: The policy that proposes gains.
         show: Called after every trial.
-        margins: What gains must keep.
+        margins: Margins for all gains, or None.
         share: The step of the policy's training over that of the environment.
 
     Raises:
@@ -225,17 +225,17 @@ def _make_trials(
 
 
 def _step_of(trained: Mapping[str, Any]) -> float:
-    """Return how far an agent may go from the incumbent in a trial."""
+    """Return an agent's longest step from the incumbent in a trial."""
     from drive_env.envs.gain_tuning import GainTuningConfig
 
     return float(trained.get("step", GainTuningConfig.step))
 
 
 def gains_for(configuration: Mapping[str, Any], device: Device) -> tuple[str, ...]:
-    """Return the names that a device has for the gains which an agent changes.
+    """Return a device's names of the gains that an agent changes.
 
-    An agent sees and changes gains over those of the baseline rule, so that neither names nor scales matter to it, but
-    the part that each plays in the cascade does.
+    An agent sees and changes gains relative to those of the baseline rule: names and scales are irrelevant, only the
+    gains' functions in the cascade count.
 
     Raises:
         ValueError: If the device lacks such a gain, or names no cascade, and there is no rule for it.
@@ -253,18 +253,18 @@ def gains_for(configuration: Mapping[str, Any], device: Device) -> tuple[str, ..
             f"{device.name} has {', '.join(missing)} among its gains, which the agent changes; train an agent for it "
             "(drive-agent train gain-tuning), or use drive-tune auto --by tpe"
         )
-    per_chip(device)  # without a cascade there is no rule to begin with
+    per_chip(device)  # without a cascade there is no rule to start from
     return tuple(device.gains.names[k] for k in columns if k is not None)
 
 
 def best_good(trials: Sequence[TrialShown], machine: int) -> TrialShown | None:
-    """Return the trial of a machine that was best by measured terms of those that can be the answer, None if none."""
+    """Return a machine's best trial by measured terms among possible answers, or None."""
     good = [trial for trial in trials if trial.good[machine]]
     return min(good, key=lambda trial: float(trial.measured[machine]), default=None)
 
 
 def _answer(trials: Sequence[TrialShown], machine: int, axes: int, wanted: Integers | None) -> int:
-    """Return the number of the trial that a machine stays with."""
+    """Return the number of the trial with a machine's final gains."""
     own = slice(machine * axes, (machine + 1) * axes)
     if wanted is not None:
         for trial in trials:
@@ -274,12 +274,12 @@ def _answer(trials: Sequence[TrialShown], machine: int, axes: int, wanted: Integ
     return 0 if best is None else best.number
 
 
-# Options of the environment that are of random machines, or that the target says.
+# Options of the environment for random machines, or defined by the target.
 NOT_OF_DRIVES = ("distributions", "privileged", "stage", "load", "motor", "device", "travel", "friction", "num_threads")
 
 
 def surrogate(target: Target, rng: np.random.Generator) -> Outcome:
-    """Tune a target with the agent that ships, as a tuner of `drive-tune rank` (entry point `drive_env.tuners`)."""
+    """Tune a target with the shipped agent, as a tuner of `drive-tune rank` (entry point `drive_env.tuners`)."""
     from tuning.outcome import Outcome
     from tuning.target import timed
 
@@ -300,7 +300,7 @@ def surrogate(target: Target, rng: np.random.Generator) -> Outcome:
 
 
 def _limits_of(drives: Drives) -> GuardLimits:
-    """Return a policy's limits: it may stay at an end of its range, and compute for long at standstill."""
+    """Return a policy's limits: it may stay at an end of its range, and compute for a long time at standstill."""
     from agents.policies.guard import PATIENT, GuardLimits
 
     envelope = drives.safety

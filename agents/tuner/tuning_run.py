@@ -1,4 +1,4 @@
-"""A run of a trained tuner on a drive: that of auto, with the agent's trials instead of its search."""
+"""A run of a trained tuner on a drive: a run of auto with the agent's trials instead of its search."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 def method_of(
     policy: Any, name: str, doubts: Sequence[str], show: Callable[[TrialShown], None], say: Callable[[str], None]
 ) -> Method:
-    """Return the method of auto that tries a policy's gains in the place of its own design.
+    """Return the method of auto that tries a policy's gains instead of its own design.
 
     Args:
-        policy: A policy for GainTuning; PolicyError in the run if it gives no number.
-        name: Of the agent, for the certificate.
-        doubts: Reservations of the certificate from the begin.
+        policy: A policy for GainTuning; PolicyError in the run if it returns non-finite numbers.
+        name: Name of the agent, for the certificate.
+        doubts: Reservations of the certificate from the beginning.
         show: Called after every trial.
-        say: Called before the first.
+        say: Called before the first trial.
     """
     from tuning.auto.one_button import Method
 
@@ -34,7 +34,7 @@ def method_of(
 
 
 def finder(policy: Any, doubts: Sequence[str], show: Callable[[TrialShown], None], say: Callable[[str], None]) -> Find:
-    """Return the search of a run of auto, by a policy's trials; arguments as `method_of` has them."""
+    """Return the search of a run of auto, by a policy's trials; arguments as for `method_of`."""
 
     def find(bench: AutoBench, basis: Basis, _: Any) -> RecordedGains:
         for doubt in doubts:
@@ -46,7 +46,7 @@ def finder(policy: Any, doubts: Sequence[str], show: Callable[[TrialShown], None
 
 
 def make_trials(bench: AutoBench, basis: Basis, policy: Any, show: Callable[[TrialShown], None]) -> RecordedGains:
-    """Make the policy's trials; return its answer, and set where moves start."""
+    """Make the policy's trials; return its answer, and set the start of moves."""
     from dataclasses import replace
 
     from agents.tuner.kept_margins import KeptMargins
@@ -60,7 +60,7 @@ def make_trials(bench: AutoBench, basis: Basis, policy: Any, show: Callable[[Tri
         return RecordedGains.only(basis.before)
     low, high = bench.room()
     try:
-        # The trials stop by themselves what oscillates, within 50 ms, and go on.
+        # The trials detect oscillation by themselves within 50 ms, stop, and continue.
         with bench.spending(going), swinging_allowed(target.drives):
             tuned = tune_target(
                 replace(target, low=low, high=high), policy, show=show, calm=basis.calm,

@@ -1,1 +1,1 @@
-"""The CAN bus around emulated nodes: a modelled wire, one time, and the ways in which a master reaches it."""
+"""The CAN bus of emulated nodes: a modelled wire, one time, and the transports by which a master connects."""

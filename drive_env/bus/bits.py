@@ -1,7 +1,8 @@
-"""Length of a classical CAN frame on the wire, in bits, with the stuff bits that its content really needs.
+"""Length of a classical CAN frame on the wire, in bits, with the stuff bits that its content needs.
 
-ISO 11898-1: from start of frame to the end of the CRC a bit of the other polarity follows every five equal bits; the
-CRC delimiter, the acknowledge slot and its delimiter, end of frame (7) and the intermission (3) are not stuffed.
+ISO 11898-1: from start of frame to the end of the CRC every five equal bits are followed by a bit of the other
+polarity; the CRC delimiter, the acknowledge slot and its delimiter, end of frame (7) and the intermission (3) are not
+stuffed.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ INTERMISSION = 3
 ERROR_FRAME = 6 + 8
 
 
-@lru_cache(maxsize=4096)  # a bus repeats itself: SYNC, requests, targets that stand still
+@lru_cache(maxsize=4096)  # frames repeat: SYNC, requests, unchanged targets
 def frame_bits(frame: Frame, extended: bool = False) -> int:
     """Return the bits that a frame takes on the bus, stuff bits and intermission included.
 
@@ -29,7 +30,7 @@ def frame_bits(frame: Frame, extended: bool = False) -> int:
 
 @lru_cache(maxsize=4096)
 def broken_frame_bits(frame: Frame, extended: bool = False) -> int:
-    """Return the bits that a frame takes whose CRC the receivers find wrong: up to there, then their error frame."""
+    """Return the bits of a frame that fails the receivers' CRC check: up to the CRC, then the error frame."""
     return stuffed_bits(frame, extended) + CRC_DELIMITER_AND_ACKNOWLEDGE + ERROR_FRAME + INTERMISSION
 
 
@@ -75,7 +76,7 @@ def _state(bit: int, run: int) -> int:
 
 
 def _after_bit(state: int, bit: int) -> tuple[int, int]:
-    """Return the state after one more bit, and how many stuff bits (0 or 1) follow it."""
+    """Return the state after one more bit, and the number of stuff bits (0 or 1) that follow it."""
     last, run = divmod(state, 4)
     run = run + 2 if bit == last else 1
     return (_state(1 - bit, 1), 1) if run == 5 else (_state(bit, run), 0)

@@ -1,4 +1,4 @@
-"""Faults of a bus: of its wire and its nodes, and of the machines behind them."""
+"""Faults of a bus: those of its wire and its nodes, and those of the machines behind them."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from mechanics.arrays import Mask
 
 logger = logging.getLogger(__name__)
 
-# What disturbs the wire itself: the wire's own words.
+# Faults of the wire itself, by its own names.
 DISTURBANCES: dict[str, Callable[[Mapping[str, float]], Faults]] = {
     "bus_loss": lambda given: Faults(drop=given["share"]),
     "bus_delay": lambda given: Faults(delay=given["share"], delay_max=given["longest"]),
@@ -33,7 +33,7 @@ DISTURBANCES: dict[str, Callable[[Mapping[str, float]], Faults]] = {
     "bus_bit_errors": lambda given: Faults(corrupt=given["share"]),
 }
 OF_ONE_NODE = ("bus_off", "second_master", "node_reset", "store_interrupted")
-MOST_BABBLE = 16  # frames of a babbler that wait for the bus: it never stops, and need not remember
+MOST_BABBLE = 16  # waiting frames of a babbler, which never stops and need not queue more
 BABBLE = bytes(8)
 
 
@@ -48,9 +48,9 @@ class BusFault(NamedTuple):
 
 @dataclass(eq=False)
 class _BusFault:
-    """A fault and where it stands: cycles at which it begins and ends, None while its condition is waited for.
+    """A fault and its state: cycles at which it begins and ends, None while waiting for its condition.
 
-    `inner` is the number that the machine gave to a fault of its own.
+    `inner` is the number that the machine gave to a fault of the machine.
     """
 
     number: int
@@ -68,7 +68,7 @@ class _BusFault:
 
 
 class BusFaults:
-    """All faults of a world, which may be given from any thread; they act as a communication cycle begins.
+    """All faults of a world, which any thread may add; they act at the beginning of a communication cycle.
 
     Args:
         world: The world.
@@ -78,7 +78,7 @@ class BusFaults:
         self._world = world
         self._lock = threading.RLock()
         self._faults: list[_BusFault] = []
-        self._ended: list[_BusFault] = []  # called off, to be ended by the world's own thread
+        self._ended: list[_BusFault] = []  # cancelled, to be ended by the world's own thread
         self._next_number = 0
         world.before_cycle.append(self._act)
 
@@ -86,12 +86,12 @@ class BusFaults:
         """Schedule a fault of the bus, or of a node and its machine; return its number.
 
         Args:
-            order: What is asked for; `node` is needed where there are several and the fault is of one, and `axis` may
-                say which axis of it.
+            order: The fault; it needs `node` if it is of one node and there are several, and may have an `axis` of that
+                node.
 
         Raises:
-            ValueError: For an unknown fault, parameter, node or axis, an invalid time or condition, or a fault that
-                this machine cannot have.
+            ValueError: For an unknown fault, parameter, node or axis, an invalid time or condition, or a fault that is
+                impossible for this machine.
         """
         row = find_fault(order.name)
         given = checked_parameters(row, order.parameters)
@@ -104,7 +104,7 @@ class BusFaults:
         with self._lock:
             if is_of_machine:
                 assert node is not None
-                # Refused here if the machine refuses it; the world's own thread gives it to the machine.
+                # Checked here, so that the machine can refuse it; the world's own thread passes it to the machine.
                 self._drives_of(node).faults.check(replace(order, axis=None))
             self._next_number += 1
             fault = _BusFault(self._next_number, order, row, given, condition, node, delay, length)
@@ -114,12 +114,12 @@ class BusFaults:
             return fault.number
 
     def listing(self) -> list[BusFault]:
-        """Return the faults that are still to come or are there."""
+        """Return the faults that are scheduled or active."""
         with self._lock:
             return [BusFault(fault.number, fault.order, fault.node, self._is_active(fault)) for fault in self._faults]
 
     def clear(self, number: int | None = None) -> None:
-        """End a fault or call it off, None all of them; ValueError for an unknown number."""
+        """End or cancel a fault; None: all of them. ValueError for an unknown number."""
         with self._lock:
             known = [fault.number for fault in self._faults]
             if number is not None and number not in known:
@@ -160,7 +160,7 @@ class BusFaults:
         return fault.ends is not None
 
     def _act(self) -> None:
-        """Begin, go on with and end faults that are due; the world calls it as a communication cycle begins."""
+        """Begin, continue and end faults that are due; the world calls it at the beginning of a communication cycle."""
         if not self._faults and not self._ended:
             return
         now = self._world.cycles
@@ -175,7 +175,7 @@ class BusFaults:
                     fault.ends = now + fault.length if fault.length < NEVER else NEVER
                     try:
                         self._begin(fault)
-                    except ValueError as error:  # a load that cannot be stepped so: the bus goes on
+                    except ValueError as error:  # the load cannot be stepped with this fault; the bus goes on
                         logger.warning("fault %d is called off: %s", fault.number, error)
                         self._faults.remove(fault)
                         continue
@@ -186,7 +186,7 @@ class BusFaults:
                     self._go_on(fault, now)
 
     def _holds(self, fault: _BusFault) -> bool:
-        """Return whether an axis of the fault's node, or any on the bus, fulfils its condition."""
+        """Return whether an axis of the fault's node, or of any node without one, fulfils its condition."""
         if fault.node is None:
             return any(bool(axes_that_fulfil(fault.condition, drives.inside).any()) for drives in self._world.drives)
         node = self._emulated(fault.node)
@@ -208,7 +208,7 @@ class BusFaults:
         if node is None or name == "babbling_node":
             return
         if name == "bus_off":
-            # Without a duration the controller is back as soon as it can be.
+            # Without a duration the controller recovers as soon as it can.
             held = 0.0 if fault.order.duration is None else fault.order.duration
             world.take_off_bus(node, world.time + held)
             if fault.order.duration is None:
@@ -221,10 +221,10 @@ class BusFaults:
             fault.inner = self._give_to_machine(fault, node)
 
     def _give_to_machine(self, fault: _BusFault, number: int) -> int:
-        """Let the machines of a node have a fault: on the axis that is asked for, or on all that they are of.
+        """Pass a fault to the machines of a node: for the given axis, or by default for all axes concerned.
 
-        Without an axis, faults of sensors, motor and supply are of the node's own axes, those of the load of all that
-        its machines have.
+        By default faults of sensors, motor and supply concern the node's own axes, those of the load all axes of its
+        machines.
         """
         node, order = self._emulated(number), fault.order
         drives = node.drives
@@ -236,14 +236,14 @@ class BusFaults:
         return drives.faults.add(replace(order, axis=None), machines, chosen if of_axis else None)
 
     def _axes_of(self, number: int) -> Mask:
-        """Return which of the drives' axes belong to a node, shape (num_axes,); without axes that have no motor."""
+        """Return which of the drives' axes belong to a node, shape (num_axes,), excluding axes without a motor."""
         node = self._emulated(number)
         axes = np.arange(node.drives.num_axes) - node.first_axis
         of_node: Mask = (axes >= 0) & (axes < node.drives.device.num_axes)
         return of_node
 
     def _check_axis(self, order: Order, is_of_machine: bool, node: int | None) -> None:
-        """Raise ValueError for an axis that the node has not, or of a fault that is of none."""
+        """Raise ValueError for an axis that the node lacks, or for a fault that does not concern an axis."""
         if order.axis is None:
             return
         if not is_of_machine or node is None:
@@ -257,7 +257,7 @@ class BusFaults:
         assert fault.begins is not None
         sender = (name, fault.number)
         if name == "babbling_node":
-            # Whole frames: as many as the rate has made since it began.
+            # whole frames, by the rate since it began
             passed = now - fault.begins
             due = int((passed + 1) * given["rate"] * CYCLE) - int(passed * given["rate"] * CYCLE)
             for _ in range(min(due, MOST_BABBLE - wire.waiting(sender))):
@@ -267,7 +267,7 @@ class BusFaults:
 
     def _end(self, fault: _BusFault) -> None:
         if fault.disturbance is not None:
-            # By identity: two faults of the same numbers are two.
+            # compared by identity: two faults with equal parameters are two
             injected = self._world.wire.injected
             injected[:] = [one for one in injected if one is not fault.disturbance]
         if fault.node is None or fault.ends is None:

@@ -1,4 +1,4 @@
-"""Any python-can interface as the way to the masters, the in-process "virtual" one for tests among them."""
+"""A transport over any python-can interface, including the in-process "virtual" one for tests."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from drive_env.bus.transport import Incoming
 from drive_env.bus.wire import Transmission, Wire
 from drive_env.canopen.frames import Frame
 
-MAX_FRAMES = 256  # taken at a turn, so that a flood does not keep time from passing
+MAX_FRAMES = 256  # handled at a turn, so that a flood does not stop time
 
 logger = logging.getLogger(__name__)
 
 
 class CanPort:
-    """A python-can bus on which the nodes live beside others.
+    """A python-can bus that the nodes share with others.
 
     Args:
         bus: An open bus; it is closed by `close`.
@@ -25,10 +25,10 @@ class CanPort:
 
     def __init__(self, bus: can.BusABC) -> None:
         self._bus = bus
-        self.lost = 0  # frames that the interface did not take
+        self.lost = 0  # frames that the interface did not accept
 
     def wait(self, timeout: float, wire: Wire) -> Iterator[Incoming]:
-        """Return the frames that have come, after at most `timeout` [s].
+        """Return received frames, after at most `timeout` [s].
 
         Raises:
             can.CanError: If the interface fails.
@@ -46,7 +46,7 @@ class CanPort:
             yield Incoming(frame, self, message.is_extended_id)
 
     def deliver(self, ended: Transmission) -> None:
-        """Send a frame of the nodes; one that came from this side is there already."""
+        """Send a frame of the nodes; a frame received from this bus is not sent again."""
         if ended.sender is self:
             return
         frame = ended.frame
@@ -59,13 +59,13 @@ class CanPort:
         )
         try:
             self._bus.send(message)
-        except can.CanError as error:  # a full buffer, or no node to acknowledge
+        except can.CanError as error:  # a full buffer, or no other node acknowledges
             self.lost += 1
             if self.lost == 1:
                 logger.warning("the interface did not take frame %s: %s", frame, error)
 
     def flush(self) -> None:
-        """Do nothing: frames have left already."""
+        """Do nothing: frames are already sent."""
 
     def close(self) -> None:
         """Close the bus."""

@@ -1,4 +1,4 @@
-"""A bus from a TOML file: which drives with which loads, their nodes, bit rate and faults. Every key has a default."""
+"""A bus from a TOML file: its drives with their loads, nodes, bit rate and faults. Every key has a default."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from mechanics.reading.untrusted import read_toml
 if TYPE_CHECKING:  # MuJoCo takes long to import
     from drive_env.emulator.emulated_drives import EmulatedDrives
 
-NO_MOTOR = "none"  # no machine is without one
+NO_MOTOR = "none"  # for a machine that always has a motor
 
 
 class BusConfigError(ValueError):
-    """The bus is impossible; the message has key, value, limit and remedy."""
+    """An invalid bus; the message has key, value, limit and remedy."""
 
 
 @dataclass(frozen=True)
 class Machine:
     """One emulated machine: device, load, motor and the identifiers of its nodes.
 
-    `motor` is by default the device's usual one. Drives that are not `commissioned` for their motor have their factory
-    values. Axes of the last node that the load does not need have no motor connected. `parameters` are true machine
-    parameters [SI] that replace defaults, as those of EmulatedDrives; `ideal` takes a stage, encoder and bearings
-    without faults. `on_ethercat` are numbers of devices, from 0 in the order of the axes, that are slaves of an
-    EtherCAT master and no nodes.
+    `motor` is by default the device's usual one. Without `commissioned` the drives have their factory values. Axes of
+    the last node that the load does not need have no motor connected. `parameters` are true machine parameters [SI]
+    that replace defaults, as for EmulatedDrives; `ideal` means a power stage, encoder and bearings without
+    imperfections. `on_ethercat` are numbers of devices, from 0 in the order of the axes, that are slaves of an EtherCAT
+    master instead of CAN nodes.
     """
 
     device: str = DEFAULT_DEVICE
@@ -46,7 +46,7 @@ class Machine:
 
     @property
     def motor_name(self) -> str:
-        """Name or file of its motor."""
+        """Name or file of the motor."""
         from drive_env.devices import find_device
 
         return self.motor or find_device(self.device).default_motor
@@ -54,12 +54,11 @@ class Machine:
 
 @dataclass(frozen=True)
 class Bus:
-    """All of a bus.
+    """The whole configuration of a bus.
 
-    `bit_rate` [bit/s]; `seed` of everything random; `store` the folder in which the nodes keep what is saved in them,
-    relative to the file; `machines` the machines; `faults` what disturbs the wire. Where some devices are on EtherCAT,
-    `ethercat_interface` and `ethercat_channel` are the way to them, as `--interface` and `--channel` of a bus that has
-    no others.
+    `bit_rate` [bit/s]; `seed` of everything random; `store` the folder of the nodes' saved parameters, relative to the
+    file; `machines` the machines; `faults` those of the wire. If some devices are on EtherCAT, `ethercat_interface` and
+    `ethercat_channel` connect them, like `--interface` and `--channel` of a bus that is all EtherCAT.
     """
 
     bit_rate: int = BIT_RATE
@@ -72,7 +71,7 @@ class Bus:
 
     @property
     def has_both(self) -> bool:
-        """Whether some devices are on EtherCAT beside those on CAN."""
+        """Whether some devices are on EtherCAT and others on CAN."""
         return any(row.on_ethercat for row in self.machines)
 
 
@@ -80,7 +79,7 @@ def load_bus(path: Path) -> Bus:
     """Return the bus that a file describes.
 
     Raises:
-        BusConfigError: For a file that cannot be read or a key or value that cannot be.
+        BusConfigError: For a file that cannot be read or an invalid key or value.
     """
     try:
         data = read_toml(path)
@@ -100,12 +99,12 @@ def build_world(bus: Bus, *, lockstep: bool, own_wire: bool = True) -> World:
     """Return the world of a bus, its nodes not switched on yet.
 
     Args:
-        bus: What it is made of.
+        bus: The configuration.
         lockstep: Time advances by SYNC.
-        own_wire: Frames take the time of the modelled wire; not so on an interface that has a wire of its own.
+        own_wire: Whether frames take the time of the modelled wire; false on an interface with a wire of its own.
 
     Raises:
-        BusConfigError: If it cannot be.
+        BusConfigError: If the bus is impossible.
     """
     check_seed(bus)
     try:
@@ -121,7 +120,7 @@ def build_world(bus: Bus, *, lockstep: bool, own_wire: bool = True) -> World:
 
 
 def build_drives(bus: Bus, k: int) -> EmulatedDrives:
-    """Return the emulated drives of machine `k` of a bus; ValueError if they cannot be."""
+    """Return the emulated drives of machine `k` of a bus; ValueError if they are impossible."""
     from drive_env.emulator.emulated_drives import EmulatedDrives
 
     row = bus.machines[k]
@@ -137,7 +136,7 @@ def build_drives(bus: Bus, k: int) -> EmulatedDrives:
 
 
 def check_devices(row: Machine) -> None:
-    """Raise ValueError where a machine says of other devices than its own that they are on EtherCAT."""
+    """Raise ValueError if a machine's `on_ethercat` names devices that it lacks."""
     from drive_env.devices import find_device
     from mechanics.loads import find_load
 
@@ -155,7 +154,7 @@ def check_devices(row: Machine) -> None:
 
 
 def check_seed(bus: Bus) -> None:
-    """Raise BusConfigError for a seed that cannot be."""
+    """Raise BusConfigError for an invalid seed."""
     if bus.seed < 0:
         raise BusConfigError(f"seed = {bus.seed} must be 0 or more")
 
@@ -172,7 +171,7 @@ def store_folder(bus: Bus) -> Path | None:
     return path
 
 
-# Keys that are more than one value: how each is read.
+# Keys with structured values, and their readers.
 def _machines(where: str, value: Any) -> tuple[Machine, ...]:
     if not isinstance(value, list):
         raise BusConfigError(f"{where} must be tables [[machines]], not {value!r}")

@@ -1,4 +1,4 @@
-"""A socket on loopback by which faults are given to a bus that is served, and by which `drive-env fault` asks.
+"""A socket on loopback by which `drive-env fault` adds faults to a served bus and lists them.
 
 One request a connection: a line of text, answered by a line of JSON. "fault NAME at=2 share=0.1" schedules one,
 "faults" lists them, "clear 3" or "clear all" ends them.
@@ -19,23 +19,23 @@ from mechanics.reading.untrusted import parse_json
 LOOPBACK = "127.0.0.1"
 PORT = 29637  # beside the hub's
 LONGEST_LINE = 4096  # bytes
-PATIENCE = 1.0  # s that a client may take for its line
-ANSWER_TIME = 5.0  # s that the server may take for its answer
+PATIENCE = 1.0  # s that a client may take to send its line
+ANSWER_TIME = 5.0  # s that the server may take to answer
 
 
 class ControlError(RuntimeError):
-    """No server answers at the address, or not as a control socket does."""
+    """No server answers at the address, or the answer is not that of a control socket."""
 
 
 class Control:
-    """The listening socket, served by a thread of its own until `close`.
+    """The listening socket, served by a separate thread until `close`.
 
     Args:
-        faults: What requests are for.
+        faults: The faults that requests act on.
         port: TCP port on loopback, 0 for a free one.
 
     Raises:
-        OSError: If the port cannot be had.
+        OSError: If the port is not available.
     """
 
     def __init__(self, faults: BusFaults, port: int = PORT) -> None:
@@ -59,7 +59,7 @@ class Control:
         while True:
             try:
                 connection, _ = self._listener.accept()
-            except OSError:  # a client that is gone again, or no file number left
+            except OSError:  # a client that has already left, or no file number left
                 if self._is_closed:
                     return
                 continue
@@ -70,7 +70,7 @@ class Control:
                     connection.settimeout(PATIENCE)
                     answer = self._answer(_line(connection))
                     connection.sendall(json.dumps(answer).encode() + b"\n")
-                except OSError:  # a client that does not speak, or does not listen
+                except OSError:  # a client that sends no line, or does not read the answer
                     continue
 
     def _answer(self, line: str) -> dict[str, Any]:
@@ -93,7 +93,7 @@ def ask(port: int, request: str) -> dict[str, Any]:
 
     Raises:
         ControlError: If no server answers there.
-        ValueError: What the server says of a request that cannot be.
+        ValueError: With the server's message about an invalid request.
     """
     remedy = f"start it with drive-env serve --control {port}, or give another --control"
     try:

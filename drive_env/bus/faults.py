@@ -1,4 +1,4 @@
-"""How the wire is disturbed on purpose."""
+"""Deliberate faults of the wire."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ LONGEST_DELAY = 3600.0  # s
 
 @dataclass(frozen=True)
 class Faults:
-    """Shares of frames, 0 to 1, that meet a fault; each frame draws for each fault by the wire's seed.
+    """Shares of frames, 0 to 1, hit by each fault; drawn for each frame with the wire's seed.
 
     Attributes:
-        drop: No node receives the frame; it takes its time on the bus all the same.
-        delay: The sender holds the frame back, and what it sends after it, for up to `delay_max` [s].
+        drop: No node receives the frame; it still takes its time on the bus.
+        delay: The sender holds this frame and its later ones back, for up to `delay_max` [s].
         duplicate: The frame is sent twice, as CAN does when the last bit of end of frame is disturbed.
-        reorder: The sender's next frame goes first; if none comes within 1 ms, nothing has happened.
-        corrupt: Every receiver finds the CRC wrong: an error frame, and the frame is sent again. This is what a
-            disturbed CAN bus does. It costs time only, up to a share of one in nine; beyond that error counters rise
-            until the sender is bus-off.
-        corrupt_undetected: One to three bits of the data are other ones and the CRC fits. CAN makes this next to
-            impossible (every error of up to five bits is found); it is for masters that must survive anything.
+        reorder: The sender's next frame goes first; without a next frame within 1 ms there is no effect.
+        corrupt: Every receiver finds the CRC wrong: an error frame, and the frame is sent again. This is how a
+            disturbed CAN bus behaves. Up to a share of 1/9 it only costs time; beyond that, error counters rise until
+            the sender is bus-off.
+        corrupt_undetected: One to three bits of the data are changed and the CRC fits. On CAN this is nearly impossible
+            (every error of up to five bits is detected); it is for masters that must survive anything.
         delay_max: Longest delay [s].
-        only: Identifiers that faults meet; empty for all.
+        only: Identifiers that faults hit; empty: all.
     """
 
     drop: float = 0.0

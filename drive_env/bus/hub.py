@@ -1,10 +1,10 @@
 """A hub on localhost: each TCP client is an slcan adapter on the same bus.
 
-Every stock python-can client joins with `interface="slcan", channel="socket://127.0.0.1:PORT"`.
+Every unmodified python-can client connects with `interface="slcan", channel="socket://127.0.0.1:PORT"`.
 
-No client can keep the bus from the others, nor make the hub grow. Clients take turns, frame by frame; a few frames of
-each wait for the bus, a few more in the hub, and the rest stays in the client's own socket until the bus has taken
-those. Who does not read is dropped, and where all places are taken a newcomer gets that of the least active client.
+No client can block the bus for the others or exhaust the hub's memory. Clients take turns, frame by frame; a few frames
+of each wait for the bus, a few more in the hub, and the rest stays in the client's own socket. A client that does not
+read is dropped; if all places are taken, a newcomer gets that of the least active client.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ from drive_env.canopen.frames import Frame
 
 LOOPBACK = "127.0.0.1"
 MAX_CLIENTS = 64
-MAX_STRANGERS = 16  # clients beyond those, that have not shown the token yet
-FILE_NUMBERS = 1024  # select() takes none above on most systems
+MAX_STRANGERS = 16  # additional clients that have not yet presented the token
+FILE_NUMBERS = 1024  # select() accepts no higher ones on most systems
 CHUNK = 512  # bytes read from a client at a turn: 23 frames of eight bytes, at most 85 empty ones
-# Frames of a client that wait for the bus, where the lowest identifier wins; those behind them wait in its socket. More
-# would only let a flood with the identifiers of another master hold that one up for longer: 1 ms for 8 frames.
+# Frames of a client that wait for the bus, where the lowest identifier wins; further ones wait in its socket. More
+# would only let a flood with another master's identifiers delay that master longer: 1 ms for 8 frames.
 MAX_WAITING = 8
 # Bytes that may wait for a client that does not read: five seconds of a full bus of 1 Mbit/s (216 kB/s as text), many
-# times what a garbage collection or a slow disk takes. The kernel holds KERNEL_BUFFER beside it.
+# times the pause of a garbage collection or a slow disk. The kernel holds KERNEL_BUFFER in addition.
 MAX_UNSENT = 1 << 20
 KERNEL_BUFFER = 1 << 18
-BUSY = 1.0  # s: a client that has sent within it is not idle; one that was behind all that time sends without end
-TOKEN_TIME = 10.0  # s in which a token must have come; stock clients wait 2 s before they send anything
-GUESS_TIME = 1.0  # s for which an address that presented a wrong token is turned away
-LOG_LINES, LOG_TIME = 20, 10.0  # warnings in so many seconds; a crowd of clients must not fill a disk
+BUSY = 1.0  # s: a client that has sent within it is active; one that was behind all that time sends without end
+TOKEN_TIME = 10.0  # s within which a token must come; unmodified clients wait 2 s before they send anything
+GUESS_TIME = 1.0  # s for which an address is refused after a wrong token
+LOG_LINES, LOG_TIME = 20, 10.0  # warnings per LOG_TIME [s]; many clients must not fill a disk
 
 logger = logging.getLogger(__name__)
 
@@ -53,16 +53,16 @@ class _Client:
     """One connection: the socket, its channel, received frames, and data that could not be sent yet.
 
     Attributes:
-        frames: That have come and are not on the wire; each extended or not.
+        frames: Received frames that are not on the wire yet; each extended or not.
         unsent: Bytes for the client.
-        blocked: Its socket takes no more bytes at present.
+        blocked: Its socket accepts no more bytes at present.
         came: When it connected [s].
-        spoke: When it sent something last [s].
-        behind_since: Since when more has come from it at every turn than was read [s].
+        spoke: When it last sent something [s].
+        behind_since: Since when it has sent more at every turn than was read [s].
         was_open: Its channel has been on the bus.
-        ended: The connection is closed; frames that came before go on to the bus.
-        dropped: So it is, and they do not.
-        told: It was said that its bit rate is another one.
+        ended: The connection is closed; its received frames still go to the bus.
+        dropped: The connection is closed, and its frames are discarded.
+        told: A warning about its other bit rate was logged.
     """
 
     def __init__(self, connection: socket.socket, address: tuple[str, int], channel: Channel, now: float) -> None:
@@ -83,7 +83,7 @@ class _Client:
         return self.socket.fileno()
 
     def has_left(self) -> bool:
-        """Whether the client has closed the connection, and all that it sent before is read."""
+        """Whether the client has closed the connection, and everything it sent has been read."""
         try:
             return not self.ended and not self.socket.recv(1, socket.MSG_PEEK)
         except (BlockingIOError, InterruptedError):
@@ -92,7 +92,7 @@ class _Client:
             return True
 
     def end(self) -> None:
-        """Close the connection; frames that have come go on to the bus."""
+        """Close the connection; received frames still go to the bus."""
         self.ended, self.blocked = True, False
         self.channel.is_open = False
         self.unsent.clear()
@@ -102,20 +102,19 @@ class _Client:
 class Hub:
     """The listening socket and its clients.
 
-    A client sees the frames of all others and of the nodes, never its own. Nothing that a client does ends the hub or
-    starves the others: a line that is no command is answered with BELL, a client that is gone is forgotten, one that
-    does not read is dropped.
+    A client sees the frames of all others and of the nodes, never its own. No client can end the hub or starve the
+    others: an unknown command is answered with BELL, a client that has left is forgotten, one that does not read is
+    dropped.
 
     Args:
         port: TCP port, 0 for a free one.
         host: Address to listen on; anything but loopback lets the network in and needs a token.
-        bit_rate: Of the bus [bit/s]; a client that sets another one stays closed.
-        token: What a client must present (command K) before it is heard, 8 to 48 letters, digits, - and _; None for
-            nothing.
+        bit_rate: Bit rate of the bus [bit/s]; the channel of a client that sets another one stays closed.
+        token: The token that a client must present first (command K), 8 to 48 letters, digits, - and _; None: no token.
 
     Raises:
-        OSError: If the address cannot be had.
-        ValueError: For an address other than loopback without a token, and for a token that cannot be.
+        OSError: If the address is not available.
+        ValueError: For an address other than loopback without a token, and for an invalid token.
     """
 
     def __init__(
@@ -128,7 +127,7 @@ class Hub:
         self._bit_rate = bit_rate
         self._token = token
         self._clients: list[_Client] = []
-        self._penalties: dict[str, float] = {}  # address -> until when it is turned away [s]
+        self._penalties: dict[str, float] = {}  # address -> until when it is refused [s]
         self._log_since, self._log_count = -LOG_TIME, 0
         self._listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         try:
@@ -160,7 +159,7 @@ class Hub:
 
         Args:
             timeout: Longest wait [s].
-            wire: For which they are; a client of which MAX_WAITING frames wait there has to wait, too.
+            wire: The wire of the frames; a client with MAX_WAITING frames waiting there has to wait, too.
         """
         readable: list[Any] = [self._listener]
         blocked = []
@@ -175,13 +174,13 @@ class Hub:
         try:
             # select.select, since selectors round the time-out of epoll up to whole milliseconds.
             ready, sendable, _ = select.select(readable, blocked, [], timeout)
-        except (OSError, ValueError):  # a connection that broke between two turns
+        except (OSError, ValueError):  # a connection broke between two turns
             self._end_broken()
             return
         now = time.monotonic()
         for client in sendable:
             self._send(client)
-        for one in reversed(ready):  # the listener last: who goes makes room for who comes
+        for one in reversed(ready):  # the listener last: clients that leave make room for new ones
             if one is self._listener:
                 self._accept(now)
             elif not one.ended:
@@ -195,7 +194,7 @@ class Hub:
         self._forget_ended(wire)
 
     def deliver(self, ended: Transmission) -> None:
-        """Hand a frame of the bus to every client but its sender; it leaves with the next `flush`."""
+        """Queue a frame of the bus for every client but its sender; `flush` sends it."""
         lines: dict[bool, bytes] = {}
         for client in self._clients:
             if client is ended.sender or not client.channel.is_open:
@@ -223,7 +222,7 @@ class Hub:
     def _accept(self, now: float) -> None:
         try:
             connection, address = self._listener.accept()
-        except OSError as error:  # gone again already, or no file number left: a client gives up its own
+        except OSError as error:  # has already left, or no file number left: a client gives up its own
             if error.errno in (errno.EMFILE, errno.ENFILE):
                 self._make_room(now)
             return
@@ -238,7 +237,7 @@ class Hub:
         try:
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, KERNEL_BUFFER)
-        except OSError:  # some systems say so here that the client has gone again
+        except OSError:  # some systems report here that the client has left
             connection.close()
             return
         client = _Client(connection, address, Channel(self._bit_rate, self._token), now)
@@ -247,13 +246,13 @@ class Hub:
             self._admit(client, now)
             return
         strangers = [other for other in self._clients if other.channel.locked and not other.ended]
-        if len(strangers) >= MAX_STRANGERS:  # they are in the order in which they came
+        if len(strangers) >= MAX_STRANGERS:  # in the order of their arrival
             self._drop(strangers[0], "it has not shown the token, and others have come")
         self._clients.append(client)
         self._append(client, TOKEN_WANTED)
 
     def _admit(self, client: _Client, now: float) -> None:
-        """Give a client one of the places on the bus, if need be that of another one."""
+        """Give a client a place on the bus, if need be that of another client."""
         taken = sum(not (other is client or other.channel.locked or other.dropped) for other in self._clients)
         if taken >= MAX_CLIENTS and not self._make_room(now, client):
             self._warn(
@@ -265,15 +264,15 @@ class Hub:
             self._clients.append(client)
 
     def _make_room(self, now: float, newcomer: _Client | None = None) -> bool:
-        """Drop the client that needs its place least; False if all are busy.
+        """Drop the client that needs its place least; False if all are active.
 
-        That is one that has gone and left frames, then one that never opened its channel, then the one that has been
-        silent for longest, then one that sends more than the bus takes. A master at work keeps its place: it sends
-        several times a second, and waits for answers.
+        In this order: a client that has left while its frames still wait, one that never opened its channel, the one
+        silent for longest, one that sends more than the bus can carry. A working master keeps its place: it sends
+        several times a second and waits for answers.
         """
         others = [c for c in self._clients if not (c is newcomer or c.channel.locked or c.dropped)]
         for client in others:
-            if client.frames and client.has_left():  # its frames are not read before they are gone
+            if client.frames and client.has_left():  # its end is noticed otherwise only after its frames
                 client.end()
         gone = [c for c in others if c.ended]
         unopened = [c for c in others if not c.was_open]
@@ -291,11 +290,11 @@ class Hub:
         return False
 
     def _refuse(self, client: _Client, now: float) -> None:
-        """Drop a client that presented a wrong token, and turn its address away for a while."""
+        """Drop a client that presented a wrong token, and refuse its address for a while."""
         self._warn("client %s was dropped: its token is wrong; its address waits %g s", client.name, GUESS_TIME)
         self._penalties = {host: until for host, until in self._penalties.items() if until > now}
         self._penalties[client.host] = now + GUESS_TIME
-        for other in self._clients:  # of guesses presented at once only the first one counts
+        for other in self._clients:  # of several tokens tried at once only the first one counts
             if other.host == client.host and other.channel.locked:
                 self._drop(other)
 
@@ -305,7 +304,7 @@ class Hub:
                 self._drop(client, f"it has not shown the token within {TOKEN_TIME:g} s")
 
     def _drop(self, client: _Client, why: str = "") -> None:
-        """End a client, with all that it wanted to send."""
+        """End a client and discard all its frames."""
         if why:
             self._warn("client %s was dropped: %s", client.name, why)
         client.frames.clear()
@@ -322,7 +321,7 @@ class Hub:
 
     @staticmethod
     def _too_high(one: socket.socket) -> bool:
-        """Whether select() cannot wait for a socket, for the number that it has."""
+        """Whether a socket's file number is too high for select()."""
         return os.name == "posix" and one.fileno() >= FILE_NUMBERS
 
     def _end_broken(self) -> None:
@@ -331,7 +330,7 @@ class Hub:
                 client.end()
 
     def _warn(self, text: str, *values: object) -> None:
-        """Log a warning, and of a crowd of them the first ones."""
+        """Log a warning, but only the first ones within LOG_TIME."""
         now = time.monotonic()
         if now - self._log_since > LOG_TIME:
             if self._log_count > LOG_LINES:
@@ -386,7 +385,7 @@ class Hub:
             client.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
 
     def _append(self, client: _Client, data: bytes) -> None:
-        """Have bytes sent to a client; one that leaves too many of them unread is dropped."""
+        """Queue bytes for a client; a client that leaves too many of them unread is dropped."""
         if len(client.unsent) + len(data) > MAX_UNSENT:
             self._drop(client, f"it does not read, and {len(client.unsent) / 1e3:.0f} kB wait for it")
         else:

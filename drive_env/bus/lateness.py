@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 BIN = 10e-6  # s
-BINS = 10_000  # the last one takes everything above 100 ms
+BINS = 10_000  # the last one counts everything above 100 ms
 
 
 class Lateness:

@@ -12,27 +12,27 @@ from drive_env.bus.world import World
 from drive_env.realtime_section import undisturbed
 
 LONGEST_WAIT = 0.05  # s until a request to stop is seen
-MOST_BEHIND = 0.25  # s; a host that slept longer does not catch up, the time is skipped
-# s. select() wakes 80 to 110 us late (Linux, idle): what is due within that time happens at once. Measured on two idle
-# cores, 1 kHz SYNC with four PDOs: 0.43 instead of 0.59 ms from SYNC to TPDO, and of SDO answers that took no time yet
-# 2,150 instead of 1,950 a second.
+MOST_BEHIND = 0.25  # s; after a longer pause of the host the time is skipped
+# s. select() wakes 80 to 110 us late (Linux, idle): events due within that time happen at once. Measured on two idle
+# cores, 1 kHz SYNC with four PDOs: 0.43 instead of 0.59 ms from SYNC to TPDO, and 2,150 instead of 1,950 SDO answers a
+# second while those took no time.
 EARLY = 100e-6
 
 
 class Server:
     """Serves a world over a transport.
 
-    In real time a cycle is due every millisecond of the wall clock; one that is late is made up for at once. `run`
-    serves in the calling thread, `start` and `stop`, or a with statement, in a thread of its own.
+    In real time a cycle is due every millisecond of the wall clock; late cycles follow at once. `run` serves in the
+    calling thread; `start` and `stop`, or a with statement, in a separate thread.
 
     Attributes:
-        lateness: Of the cycles begun in real time [s].
-        skipped: Time that was not made up for [s].
+        lateness: Lateness of the cycles begun in real time [s].
+        skipped: Time that was skipped [s].
         guard: Held while the world is changed; take it for changes from another thread.
 
     Args:
-        world: What is served.
-        transport: Where its masters are.
+        world: The world to serve.
+        transport: Connects its masters.
     """
 
     def __init__(self, world: World, transport: Transport) -> None:
@@ -65,7 +65,7 @@ class Server:
         self.transport.flush()
 
     def start(self) -> None:
-        """Serve in a thread of its own; all nodes are on when this returns."""
+        """Serve in a separate thread; all nodes are on when this returns."""
         self.world.power_on()
         self._thread = threading.Thread(target=self._run_guarded, name="bus server", daemon=True)
         self._thread.start()
@@ -134,7 +134,7 @@ class Server:
         return self._start > 0.0
 
     def catch_up(self) -> None:
-        """Let everything happen that is due in real time; the caller holds the guard."""
+        """Run everything that is due in real time; the caller holds the guard."""
         late = self._now() - self.world.next_cycle
         if late > MOST_BEHIND:
             self.skipped += late

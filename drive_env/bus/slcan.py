@@ -1,11 +1,11 @@
-"""The slcan protocol (Lawicel's ASCII commands), adapter's side: lines to frames, frames to lines.
+"""The slcan protocol (Lawicel's ASCII commands), adapter's side: converts lines and frames.
 
-python-can's slcan interface waits for no answer and reads each answer as a turn without a frame. Commands are answered
-all the same, as Lawicel's manual says; frames sent are not (nor does a CANable answer them), or every frame of a
-burst would cost the client a turn.
+python-can's slcan interface waits for no answer; reading one costs it a turn without a frame. Commands are answered as
+in Lawicel's manual; sent frames are not (nor does a CANable answer them), since every frame of a burst would cost the
+client a turn.
 
-One command is ours: K followed by a token. A channel that asks for one says "K" as its client comes (the hub sends it),
-and neither understands nor answers anything until it has got it.
+One command is our own: K followed by a token. A channel that requires a token sends "K" when its client connects
+(through the hub), and ignores everything until it has received the token.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ VERSION = b"V1013\r"  # hardware 1.0, software 1.3
 SERIAL_NUMBER = b"NDE01\r"
 CLOCK = 8_000_000  # Hz, of the SJA1000's bit timing registers
 TOKEN_WANTED = b"K\r"
-TOKEN = re.compile(r"[A-Za-z0-9_-]{8,48}")  # lines are short, and at a guess a second eight characters are not found
+TOKEN = re.compile(r"[A-Za-z0-9_-]{8,48}")  # lines are short, and eight characters withstand one guess a second
 
 _STANDARD = re.compile(rb"[tr]([0-7][0-9A-Fa-f]{2})([0-8])((?:[0-9A-Fa-f]{2})*)")
 _EXTENDED = re.compile(rb"[TR]([01][0-9A-Fa-f]{7})([0-8])((?:[0-9A-Fa-f]{2})*)")
-# Commands that need nothing of this adapter: acceptance filters, polling, serial speed, start-up, data bit rate.
+# Commands without effect here: acceptance filters, polling, serial speed, start-up, data bit rate.
 _ACCEPTED = re.compile(rb"[Mm][0-9A-Fa-f]{8}|[XQW][0-2]|U[0-6]|[AP]|Y[0-9]")
 
 
@@ -52,7 +52,7 @@ def parse_frame(line: bytes) -> tuple[Frame, bool]:
 
 
 def format_frame(frame: Frame, extended: bool = False, timestamp_ms: int | None = None) -> bytes:
-    """Return the line of a frame, with a time stamp [ms, 0 to 59,999] if one is given."""
+    """Return the line of a frame, with a time stamp [ms, 0 to 59,999] unless None."""
     length = (frame.dlc or 0) if frame.rtr else len(frame.data)
     kind = (b"R" if extended else b"r") if frame.rtr else (b"T" if extended else b"t")
     can_id = b"%08X" % frame.can_id if extended else b"%03X" % frame.can_id
@@ -61,7 +61,7 @@ def format_frame(frame: Frame, extended: bool = False, timestamp_ms: int | None 
 
 
 def check_token(token: str) -> None:
-    """Raise ValueError for a token that no line can carry, or that is too short; the message does not repeat it."""
+    """Raise ValueError for a token that is too short or does not fit into a line; the message does not repeat it."""
     if TOKEN.fullmatch(token) is None:
         raise ValueError(f"a token has 8 to 48 letters, digits, - and _; this one has {len(token)} characters")
 
@@ -74,13 +74,13 @@ class Channel:
         is_open: It takes part in the bus.
         listen_only: It sends nothing.
         time_stamps: Frames come with the time of their reception.
-        refused: It was to be opened with another bit rate than the bus has.
-        locked: Its token has not come yet.
-        wrong_token: Another one has come; nothing that follows is looked at.
+        refused: Its client tried to open it with another bit rate than that of the bus.
+        locked: Its token has not been received yet.
+        wrong_token: A wrong token was received; everything after it is ignored.
 
     Args:
-        bit_rate: Of the bus [bit/s].
-        token: What its client must present first; None for nothing.
+        bit_rate: Bit rate of the bus [bit/s].
+        token: The token that its client must present first; None: no token.
     """
 
     def __init__(self, bit_rate: float, token: str | None = None) -> None:
@@ -97,7 +97,7 @@ class Channel:
         self._overlong = False
 
     def feed(self, data: bytes) -> tuple[list[tuple[Frame, bool]], bytes]:
-        """Take bytes of the client; return its frames, each extended or not, and the answer to its commands."""
+        """Parse bytes of the client; return its frames, each extended or not, and the answer to its commands."""
         frames: list[tuple[Frame, bool]] = []
         answer = bytearray()
         *lines, rest = (self._line + data).replace(b"\n", b"\r").split(b"\r")
@@ -107,13 +107,13 @@ class Channel:
             else:
                 answer += BELL if self._overlong else self._take(line, frames)
             self._overlong = False
-        if len(rest) > MAX_LINE:  # never a command: forget it up to its end
+        if len(rest) > MAX_LINE:  # too long for a command: skip it to its end
             self._overlong, rest = True, b""
         self._line = b"" if self._overlong else rest
         return frames, bytes(answer)
 
     def format(self, frame: Frame, extended: bool, time: float) -> bytes:
-        """Return the line by which the client learns of a frame received at `time` [s]."""
+        """Return the line that reports a frame received at `time` [s] to the client."""
         return format_frame(frame, extended, int(time * 1e3) if self.time_stamps else None)
 
     # --- inside ---------------------------------------------------------------------------------------------------
@@ -152,14 +152,14 @@ class Channel:
         if kind == b"N" and not argument:
             return SERIAL_NUMBER
         if kind == b"F" and not argument and self.is_open:
-            return b"F00\r"  # no error: who is too slow is not told of an overrun but dropped
+            return b"F00\r"  # no error: a client that is too slow is dropped, not told of an overrun
         if kind == b"Z" and argument in (b"0", b"1") and not self.is_open:
             self.time_stamps = argument == b"1"
             return OK
         return OK if _ACCEPTED.fullmatch(kind + argument) else BELL
 
     def _open(self, listen_only: bool) -> bytes:
-        # A controller with another bit rate understands nothing and would destroy every frame: it stays closed.
+        # A controller with another bit rate would understand nothing and destroy every frame: it stays closed.
         if self.bit_rate != self._bus_bit_rate:
             self.refused = True
             return BELL

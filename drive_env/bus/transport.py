@@ -21,13 +21,13 @@ class Transport(Protocol):
     """A hub, or a python-can interface."""
 
     def wait(self, timeout: float, wire: Wire) -> Iterable[Incoming]:
-        """Return a few frames that have come for the wire, after at most `timeout` [s]."""
+        """Return a few frames received for the wire, after at most `timeout` [s]."""
 
     def deliver(self, ended: Transmission) -> None:
-        """Take a frame of the bus for all masters but its sender."""
+        """Queue a frame of the bus for all masters but its sender."""
 
     def flush(self) -> None:
-        """Send the frames taken so far."""
+        """Send the queued frames."""
 
     def close(self) -> None:
-        """End it."""
+        """Close it."""

@@ -1,4 +1,4 @@
-"""The modelled wire: bit rate, arbitration, length of frames, faults by seed. It works in the time handed to it."""
+"""The modelled wire: bit rate, arbitration, length of frames, faults by seed. Its callers pass the time."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from drive_env.bus.faults import Faults
 from drive_env.canopen.frames import Frame
 
 BIT_RATE = 1_000_000  # bit/s, the factory bit rate of the TMCM-1636
-REORDER_WINDOW = 0.001  # s: how long a frame to be overtaken waits for the one that overtakes it
-MOST_SENDERS = 256  # beyond that those with nothing to send are forgotten
+REORDER_WINDOW = 0.001  # s for which a frame to be overtaken waits for the next one
+MOST_SENDERS = 256  # beyond that, senders without waiting frames are forgotten
 # ISO 11898-1, fault confinement: the transmit error counter.
 ERROR_STEP, PASSIVE_LIMIT, BUS_OFF_LIMIT = 8, 128, 256
 BUS_OFF_RECOVERY = 128 * 11  # bits of silence until a controller that was bus-off may send again
@@ -26,9 +26,9 @@ Outcome = Literal["received", "lost", "error", "error passive", "bus off"]
 class Transmission(NamedTuple):
     """A transmission that ended on the bus at time `end` [s], and its result.
 
-    "received": everybody but the sender has it. "lost": a fault kept it from everybody. "error": an error frame ended
-    it and the sender tries again; "error passive": the same, and the sender's controller has become error passive;
-    "bus off": the controller has given up all that it had to send and is silent for 128 times 11 bits.
+    "received": all nodes but the sender have it. "lost": because of a fault no node has it. "error": an error frame
+    ended it and the sender tries again; "error passive": the same, and the sender's controller has become error
+    passive; "bus off": the controller has dropped its waiting frames and is silent for 128 times 11 bits.
     """
 
     frame: Frame
@@ -50,7 +50,7 @@ class WireStatistics:
     most_waiting: int = 0
 
     def load(self, bit_rate: float, duration: float) -> float:
-        """Return the share of time [s] in which the bus was busy; above 1 only where frames take no time."""
+        """Return the share of time [s] in which the bus was busy; above 1 only if frames take no time."""
         return self.bits / (bit_rate * duration) if duration > 0.0 else 0.0
 
 
@@ -75,17 +75,17 @@ class Wire:
     """One bus.
 
     Whenever it falls idle, the senders whose first frame is ready arbitrate: the lowest identifier wins, a data frame
-    over a remote one, a standard frame over an extended one with the same first eleven bits; among equals the one who
-    came first (on a real bus they would collide; two nodes of one identifier are a mistake of the master).
+    over a remote one, a standard frame over an extended one with the same first eleven bits; among equals the first to
+    arrive (on a real bus they would collide; two nodes with one identifier are a mistake of the master).
 
     Args:
         bit_rate: [bit/s].
-        instant: Frames take no time, as in lockstep, but order, length and faults stay.
-        faults: What disturbs it.
+        instant: Whether frames take no time, as in lockstep; order, length and faults stay.
+        faults: Its permanent faults.
         seed: Seed of the faults.
 
     Attributes:
-        injected: What else disturbs it at present.
+        injected: Further faults that act at present.
     """
 
     def __init__(
@@ -105,7 +105,7 @@ class Wire:
         self._on_wire: Transmission | None = None
 
     def send(self, frame: Frame, sender: Hashable, now: float, extended: bool = False) -> None:
-        """Hand a frame to a sender's controller at `now` [s], which is never before the last one handed in."""
+        """Hand a frame to a sender's controller at `now` [s]; times must not decrease."""
         controller = self._senders.get(sender)
         if controller is None:
             controller = self._add(sender)
@@ -121,12 +121,12 @@ class Wire:
         self._give_up(self._add(sender) if controller is None else controller, until)
 
     def waiting(self, sender: Hashable) -> int:
-        """Return how many frames a sender has not brought to the bus yet."""
+        """Return the number of a sender's frames that wait for the bus."""
         controller = self._senders.get(sender)
         return len(controller.queue) if controller else 0
 
     def forget(self, sender: Hashable) -> None:
-        """Take a sender's controller off the bus, with all that it had to send; a transmission that has begun ends."""
+        """Remove a sender's controller with its waiting frames; a transmission that has begun is completed."""
         controller = self._senders.pop(sender, None)
         if controller is not None:
             self._num_waiting -= len(controller.queue)
@@ -138,7 +138,7 @@ class Wire:
         return BUS_OFF_RECOVERY / self.bit_rate
 
     def next_event(self) -> float:
-        """Return when a transmission ends or can begin next [s]; inf if nothing waits."""
+        """Return when a transmission next ends or can begin [s]; inf if no frame waits."""
         if self._on_wire is not None:
             return self._on_wire.end
         if not self._num_waiting:
@@ -146,9 +146,9 @@ class Wire:
         return max(self._free_at, min(c.queue[0].ready for c in self._senders.values() if c.queue))
 
     def take(self, until: float) -> Transmission | None:
-        """Return the next transmission that ends at `until` [s] or before, None if no transmission does.
+        """Return the next transmission that ends at `until` [s] or before, None if there is none.
 
-        Who wins arbitration is settled only when the bus is free: call it with times that have come.
+        Arbitration is decided only when the bus is free, so call it with the present time, not a future one.
         """
         if self._on_wire is None:
             start = self.next_event()
@@ -163,7 +163,7 @@ class Wire:
 
     # --- inside ---------------------------------------------------------------------------------------------------
     def _add(self, sender: Hashable) -> _Sender:
-        if len(self._senders) >= MOST_SENDERS:  # clients that have left are not known as such
+        if len(self._senders) >= MOST_SENDERS:  # clients that have left are not reported
             self._senders = {name: c for name, c in self._senders.items() if c.queue}
         controller = self._senders[sender] = _Sender()
         return controller
@@ -180,7 +180,6 @@ class Wire:
             queue.append(waiting)
 
     def _disturbing(self, frame: Frame) -> Sequence[Faults]:
-        """Return the faults that apply to a frame."""
         if not self.faults and not self.injected:
             return ()
         return [one for one in (self.faults, *self.injected) if one and (not one.only or frame.can_id in one.only)]
@@ -196,7 +195,7 @@ class Wire:
             waiting.ready = max(waiting.ready, now + REORDER_WINDOW)
 
     def _begin(self, start: float) -> Transmission:
-        """Arbitrate at `start` [s] and return how the winner's transmission will end."""
+        """Arbitrate at `start` [s] and return the winner's transmission with its result."""
         name, controller = min(
             ((name, c) for name, c in self._senders.items() if c.queue and c.queue[0].ready <= start),
             key=lambda pair: (_arbitration_field(pair[1].queue[0]), pair[1].queue[0].ready),
@@ -210,7 +209,7 @@ class Wire:
         bits = (broken_frame_bits if outcome == "error" else frame_bits)(frame, extended)
         end = start + bits * self._bit_time
         if outcome == "error":
-            outcome = self._count_error(controller, end)  # still first of its sender's queue, unless that gave up
+            outcome = self._count_error(controller, end)  # still first in its queue, unless bus-off has emptied it
         else:
             controller.queue.popleft()
             self._num_waiting -= 1
@@ -239,7 +238,7 @@ class Wire:
         """Return the error counter of a sender's controller."""
         ending = self._on_wire
         if ending is not None and ending.sender == sender and ending.outcome == "bus off":
-            return BUS_OFF_LIMIT  # the frame that is the last one has not ended yet
+            return BUS_OFF_LIMIT  # its last frame has not ended yet
         controller = self._senders.get(sender)
         return 0 if controller is None else controller.error_counter
 
@@ -263,8 +262,8 @@ class Wire:
 def _arbitration_field(waiting: _Waiting) -> tuple[int, bool, int, bool]:
     """Return the bits of arbitration: base identifier, extended or not, extension, remote or not; dominant is lower.
 
-    In a standard frame the remote bit lies where an extended one has its substitute, which is recessive: a standard
-    frame of either kind wins, its identifier extension bit being dominant.
+    A standard frame has its remote bit where an extended one has the recessive substitute bit: a standard frame of
+    either kind wins, since its identifier extension bit is dominant.
     """
     can_id = waiting.frame.can_id
     if waiting.extended:

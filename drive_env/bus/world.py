@@ -14,16 +14,16 @@ from drive_env.canopen.node import Node
 from drive_env.emulator.emulated_drives import EmulatedDrives
 
 CYCLE = 0.001  # s: the communication cycle
-# Frames of a node that wait for the bus, for each of its axes; ours, since no manual says. More are lost.
+# Frames of a node that may wait for the bus, per axis; our choice, since no manual gives one. Further ones are lost.
 TRANSMIT_BUFFER = 64
 MAX_NODE_ID = 127
 
 
 class BusNode(Protocol):
-    """The calls of a world to a node; drive_env/canopen/node.py says what each means."""
+    """The calls of a world to a node; their meaning is described in drive_env/canopen/node.py."""
 
     def receive(self, frame: Frame, now: float) -> None:
-        """Take a frame of the bus."""
+        """Receive a frame of the bus."""
 
     def before_cycle(self, now: float) -> None:
         """Prepare for a communication cycle."""
@@ -32,52 +32,52 @@ class BusNode(Protocol):
         """Send the results of a communication cycle."""
 
     def error_passive(self, now: float) -> None:
-        """Learn that its controller has become error passive."""
+        """Note that its controller has become error passive."""
 
     def overrun(self, now: float, buffer: str) -> None:
-        """Learn that frames were lost in the "transmit" buffer."""
+        """Note that frames were lost in the "transmit" buffer."""
 
     def bus_off(self, now: float) -> None:
-        """Learn that its controller has left the bus."""
+        """Note that its controller is bus-off."""
 
     def bus_on(self, now: float) -> None:
-        """Learn that its controller is back."""
+        """Note that its controller has recovered from bus-off."""
 
     def power_on(self, now: float) -> None:
         """Boot."""
 
 
 class Beside(Protocol):
-    """A second fieldbus of the same machines, which lives by a world's time."""
+    """A second fieldbus of the same machines, which follows a world's time."""
 
     def begin_cycle(self) -> None:
         """Prepare for a communication cycle."""
 
     def end_cycle(self) -> None:
-        """Take the results of a communication cycle."""
+        """Handle the results of a communication cycle."""
 
     def pass_time(self, now: float) -> None:
         """Run everything due between cycles until `now` [s]."""
 
     def next_event(self) -> float:
-        """Return when something is due next [s]."""
+        """Return when something is next due [s]."""
 
 
 class World:
     """Nodes and their drives on one bus.
 
-    In lockstep each SYNC from outside lets one communication cycle pass and nothing else does; frames take no time.
-    They are looked at one by one: what a frame sets off is sent before the next is looked at, so a master that sends
-    SYNC, SYNC and an SDO request knows by the answer that both cycles are over. Otherwise time is what `run_until`
-    says, and frames take the time that the wire says.
+    In lockstep each SYNC from outside lets one communication cycle pass, and only SYNC does; frames take no time.
+    Frames are handled one by one: all responses to a frame are sent before the next one, so a master that sends SYNC,
+    SYNC and an SDO request knows by the answer that both cycles are over. Otherwise `run_until` sets the time, and
+    frames take the wire's time.
 
     Attributes:
-        nodes: Node identifier -> node; those that begin without one have numbers from 128 on here.
+        nodes: Node identifier -> node; nodes that begin without one have numbers from 128 on here.
         drives: All emulated drives, each a set with its nodes.
-        machines: Those of `drives` that have a load, in the order in which they were added.
-        listeners: Called with each frame that everybody received, also its own sender.
-        before_cycle: Called as a communication cycle begins; they may send by the wire.
-        beside: Another fieldbus of these drives, that lives by this world's time; None without one.
+        machines: Those of `drives` with a load, in the order in which they were added.
+        listeners: Called with each frame that all nodes received.
+        before_cycle: Called at the beginning of a communication cycle; they may send by the wire.
+        beside: Another fieldbus of these drives, which follows this world's time; None without one.
         time: Time since the world began [s].
         cycles: Communication cycles that have passed.
 
@@ -97,12 +97,12 @@ class World:
         self.beside: Beside | None = None
         self.time = 0.0
         self.cycles = 0
-        self._answering: list[Node] = []  # whose SDO answers take time
-        self._synchronised: list[Node] = []  # by SYNC, of whose identifiers each has its own
+        self._answering: list[Node] = []  # nodes with SDO answers that take time
+        self._synchronised: list[Node] = []  # nodes that react to SYNC, each with its own identifier
         self._room: dict[int, int] = {}  # node identifier -> frames that may wait
         self._on: set[int] = set()
         self._overflowed: set[int] = set()
-        self._off: dict[int, float] = {}  # node identifier -> when its controller is back [s]
+        self._off: dict[int, float] = {}  # node identifier -> when its controller has recovered [s]
 
     def add(
         self,
@@ -113,12 +113,12 @@ class World:
     ) -> list[Node]:
         """Put drives on the bus, one node per device, and return the nodes.
 
-        Axes of the last node that the machines leave over have no motor connected.
+        Axes of the last node beyond those of the machines have no motor connected.
 
         Args:
             drives: The drives; machines of several one-axis devices have as many nodes as axes.
             node_ids: Identifiers 1 to 127 in the order of the axes; 255, of devices with LSS, for a node without one.
-            store: Folder of the nodes' stored values; without one they live as long as the world.
+            store: Folder of the nodes' stored values; None: they last as long as the world.
             elsewhere: Numbers of the devices, from 0 in the order of the axes, that are not on this bus.
 
         Raises:
@@ -150,7 +150,7 @@ class World:
                 given: int = given,
             ) -> Node:
                 bit_rate = round(self.wire.bit_rate)
-                real = not self.lockstep  # docs/decisions/bus.md has why nothing takes time in lockstep
+                real = not self.lockstep  # docs/decisions/bus.md explains why nothing takes time in lockstep
                 node = Node(
                     given, drives, k * per_node, send=send, store=path, bit_rate=bit_rate, takes_time=real,
                     spare=spare if k == needed - 1 else None, serial=node_id,
@@ -174,7 +174,7 @@ class World:
         return f" ({elsewhere} of them on EtherCAT)" if elsewhere else ""
 
     def attach(self, node_id: int, make: Callable[[Callable[[Frame], None]], BusNode]) -> None:
-        """Put a node on the bus that `make` returns when handed the function by which it sends."""
+        """Put a node on the bus; `make` builds it from the function by which it sends."""
         if not 1 <= node_id <= MAX_NODE_ID:
             raise ValueError(f"node {node_id} is out of range; identifiers are 1 to {MAX_NODE_ID}")
         if node_id in self.nodes:
@@ -193,28 +193,28 @@ class World:
             self._settle()
 
     def receive(self, frame: Frame, sender: Hashable = "master", *, extended: bool = False) -> None:
-        """Take a frame from outside, at the world's time.
+        """Receive a frame from outside, at the world's time.
 
         Args:
             frame: The frame.
-            sender: Whose it is; the frames of one sender keep their order.
-            extended: It has a 29-bit identifier; no node sees it.
+            sender: Its sender; the frames of one sender keep their order.
+            extended: Whether it has a 29-bit identifier; nodes ignore it.
         """
         self.wire.send(frame, sender, self.time, extended)
         if self.lockstep:
             self._settle()
-            # A SYNC that the wire loses lets time pass all the same: it is the nodes that miss it.
+            # A SYNC that the wire loses still lets time pass: only the nodes miss it.
             if not extended and self._is_sync(frame):
                 self.cycle()
                 self._settle()
 
     def run_until(self, now: float, begins: Callable[[float], None] | None = None, early: float = 0.0) -> None:
-        """Let everything happen in its order that is due until `now` [s]; not in lockstep.
+        """Run all events due until `now` [s], in their order; not in lockstep.
 
         Args:
             now: New time of the world [s].
-            begins: Called as a communication cycle begins, with the time when it was due [s].
-            early: What is due within this time [s] after `now` happens already.
+            begins: Called at the beginning of a communication cycle, with its due time [s].
+            early: Events due within this time [s] after `now` happen already.
         """
         until = now + early
         while True:
@@ -242,7 +242,7 @@ class World:
         return (self.cycles + 1) * CYCLE
 
     def next_event(self) -> float:
-        """Return when `run_until` has something to do next [s]."""
+        """Return when `run_until` next has something to do [s]."""
         beside = math.inf if self.beside is None else self.beside.next_event()
         return min(self.next_cycle, self.wire.next_event(), self._next_answer(), beside)
 
@@ -270,14 +270,14 @@ class World:
             node.after_cycle(self.time)
 
     def take_off_bus(self, node_id: int, until: float) -> None:
-        """Let a node be bus-off until `until` [s], not shorter than its controller needs to recover."""
+        """Take a node off the bus until `until` [s], at least as long as its controller needs to recover."""
         until = max(until, self.time + self.wire.recovery_time)
         self.wire.silence(("node", node_id), until)
         self._off[node_id] = until
         self.nodes[node_id].bus_off(self.time)
 
     def let_recover(self, node_id: int) -> None:
-        """Let a node that is bus-off be back as the next communication cycle begins."""
+        """Let a node that is bus-off recover at the beginning of the next communication cycle."""
         if node_id in self._off:
             self.wire.silence(("node", node_id), self.time)
             self._off[node_id] = self.time
@@ -296,23 +296,22 @@ class World:
 
     # --- inside ---------------------------------------------------------------------------------------------------
     def _next_answer(self) -> float:
-        """Return when the next SDO answer is ready [s]."""
         return min((node.next_answer for node in self._answering), default=math.inf)
 
     def _room_of(self, node_id: int) -> int:
-        """Return how many frames of a node may wait."""
+        """Return the number of a node's frames that may wait."""
         return self._room.get(node_id, TRANSMIT_BUFFER)
 
     def _send(self, node_id: int, frame: Frame) -> None:
         sender = ("node", node_id)
         if self.wire.waiting(sender) < self._room_of(node_id):
             self.wire.send(frame, sender, self.time)
-        else:  # the node is told once there is room for its emergency
+        else:  # the node is notified once there is room for its emergency
             self._overflowed.add(node_id)
             self.wire.statistics.lost += 1
 
     def _is_sync(self, frame: Frame) -> bool:
-        """Return whether a frame is SYNC, with or without a counter, to the nodes (1005h can be changed)."""
+        """Return whether a frame is a SYNC to the nodes, with or without a counter (1005h can be changed)."""
         if frame.rtr or len(frame.data) > 1:
             return False
         if not self._synchronised:
@@ -320,7 +319,7 @@ class World:
         return any(frame.can_id == node.sync_id for node in self._synchronised)
 
     def _settle(self) -> None:
-        """Carry frames until none is ready at this time, and no segment of a block upload either."""
+        """Carry frames until no frame, nor a segment of a block upload, is ready at this time."""
         while True:
             while (ended := self.wire.take(self.time)) is not None:
                 self._pass_on(ended)
@@ -328,7 +327,7 @@ class World:
                 return
             for node in self._answering:
                 node.answer(self.time)
-            if self.wire.next_event() > self.time:  # none could send any
+            if self.wire.next_event() > self.time:  # no node could send one
                 return
 
     def _pass_on(self, ended: Transmission | None) -> None:
@@ -350,7 +349,7 @@ class World:
 
 
 def without_motors(drives: EmulatedDrives, number: int) -> EmulatedDrives:
-    """Return axes of the same device with factory values and open phases, as those without a motor have."""
+    """Return axes of the same device with factory values and open phases, for axes without a motor."""
     open_phases = {"motor.open_a": 1.0, "motor.open_b": 1.0}
     return EmulatedDrives(
         drives.device.name, "inertia", drives.motor, number, commissioned=False, parameters=open_phases, num_threads=1

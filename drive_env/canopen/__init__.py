@@ -1,1 +1,1 @@
-"""The drive's side of a CANopen network: frames in, frames out, and the object dictionary behind them."""
+"""The drive's side of a CANopen network: services, and the object dictionary behind them."""

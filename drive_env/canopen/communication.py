@@ -1,4 +1,4 @@
-"""The objects of CANopen's communication, 1005h to 1FFFh, and the rule that a write of each keeps."""
+"""The objects of CANopen's communication, 1005h to 1FFFh, and the checks of their writes."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ RPDO_MAPPING = range(0x1600, 0x1800)
 TPDO = range(0x1800, 0x1A00)
 TPDO_MAPPING = range(0x1A00, 0x1C00)
 PDO = range(0x1400, 0x1C00)
-TO_MAPPING = 0x200  # from a PDO's communication parameter to its mapping
-CYCLE_US = 1000  # a node does what it does by itself once in a communication cycle
+TO_MAPPING = 0x200  # offset of a PDO's mapping from its communication parameter
+CYCLE_US = 1000  # a node acts by itself once per communication cycle
 
 
 class ModuleObjects(NodeObjects):
@@ -42,12 +42,12 @@ class ModuleObjects(NodeObjects):
 
     @property
     def services(self) -> NodeServices:
-        """Parts of the node that the device has."""
+        """Optional services of the device."""
         return self._device.canopen.services
 
     @property
     def quirks(self) -> NodeQuirks:
-        """Where the device differs from the standard."""
+        """Deviations of the device from the standard."""
         return self._device.canopen.quirks
 
     def _rule(self, entry: Entry) -> Callable[[int], None] | None:
@@ -55,7 +55,7 @@ class ModuleObjects(NodeObjects):
         return None if rule is None else partial(rule, self, entry)
 
     def _fixed(self, entry: Entry) -> int:
-        """Return the bits that are set whatever is written: bit 30 of a PDO's COB-ID, where the factory's has it."""
+        """Return the bits that are set in every written value: bit 30 of a PDO's COB-ID, if the factory's has it."""
         if not is_pdo_id(entry) or (entry.index in RPDO and self.quirks.rpdo_bit_30 == "store"):
             return 0
         return self.factory_value(entry) & frames.NO_REMOTE
@@ -78,8 +78,8 @@ def _check_bits(entry: Entry, raw: int, allowed: int) -> None:
 
 
 def _check_identifier(objects: ModuleObjects, entry: Entry, raw: int, *, changes_while_on: bool = False) -> None:
-    """Check an object of which bit 31 switches the service off (CiA 301: 1014h, 1400h, 1800h)."""
-    # First what is never possible: a master that set bit 31 and tried again would be refused then.
+    """Check a write of an object whose bit 31 switches a service off (CiA 301: 1014h, 1400h, 1800h)."""
+    # First the impossible values: a master that set bit 31 and tried again would be refused only then.
     if raw & frames.INVALID == 0 and frames.is_restricted(raw & frames.IDENTIFIER):
         raise ObjectAccessError(
             VALUE_RANGE, f"{entry.label} cannot be {raw & frames.IDENTIFIER:03X}h, which CiA 301 reserves"
@@ -92,8 +92,8 @@ def _check_identifier(objects: ModuleObjects, entry: Entry, raw: int, *, changes
 
 
 def _check_sync_id(objects: ModuleObjects, entry: Entry, raw: int) -> None:
-    # Bit 30 makes the device produce SYNC, at the period of 1006h, where it can.
-    # Bit 31 says nothing by CiA 301; it is taken where the factory's value has it.
+    # Bit 30 makes the device produce SYNC with the period of 1006h, if it can. Bit 31 has no meaning in CiA 301; it is
+    # accepted if the factory's value has it.
     produce = frames.PRODUCE if objects.services.sync_producer else 0
     _check_bits(entry, raw, frames.IDENTIFIER | produce | objects.factory_value(entry) & frames.INVALID)
     _check_unrestricted(entry, raw)
@@ -129,7 +129,7 @@ def _check_unrestricted(entry: Entry, raw: int) -> None:
 
 
 def _check_off(objects: ModuleObjects, entry: Entry, raw: int, bits: int) -> None:
-    """Raise 08000022h for another identifier while the service is on, and stays so."""
+    """Raise 08000022h for another identifier while the service is on and stays on."""
     before = objects.value(entry.index, entry.sub)
     if before & bits and raw & bits and (before ^ raw) & frames.IDENTIFIER:
         named = " and ".join(str(bit) for bit in (30, 31) if bits >> bit & 1)
@@ -178,7 +178,7 @@ def _check_mapping(objects: ModuleObjects, entry: Entry, raw: int) -> None:
     if entry.sub == 0:
         raws = [objects.value(entry.index, sub) for sub in range(1, raw + 1)]
         mapping.check_mapping(entry, raws, transmit, objects.find)
-    elif raw != 0:  # an empty entry, as the factory's are
+    elif raw != 0:  # else an empty entry, as in the factory's mapping
         mapping.check_mappable(entry, raw, transmit, objects.find)
 
 
@@ -202,9 +202,9 @@ def _rule(index: int) -> Rule | None:
 
 # --- bit rates -------------------------------------------------------------------------------------------
 def known_bit_rate(device: Device, bit_rate: int) -> int:
-    """Return a bit rate [bit/s] as 2704h counts it [kbit/s]; ValueError if the device does not have it.
+    """Return a bit rate [bit/s] in the units of 2704h [kbit/s]; ValueError if the device does not have it.
 
-    One without such an object has every bit rate.
+    A device without such an object has every bit rate.
     """
     key = device.canopen.objects.get("bit_rate")
     known = None if key is None else device.allowed_values.get(key)

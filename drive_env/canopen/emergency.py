@@ -16,7 +16,7 @@ class EmergencyProducer:
     """Sends emergencies in their order, no faster than the inhibit time allows.
 
     Args:
-        send: Takes a frame.
+        send: Sends a frame.
         num_axes: Axes of the node.
 
     Attributes:
@@ -32,7 +32,7 @@ class EmergencyProducer:
         self.configure(None, 0.0)
 
     def configure(self, can_id: int | None, inhibit: float) -> None:
-        """Take over identifier, None if switched off, and inhibit time [s]."""
+        """Set identifier, None if switched off, and inhibit time [s]."""
         self._can_id = can_id
         self._inhibit = inhibit
 
@@ -44,7 +44,7 @@ class EmergencyProducer:
             self.told = error_register
 
     def flush(self, now: float) -> None:
-        """Send the waiting emergencies that the inhibit time lets go at `now` [s]."""
+        """Send the waiting emergencies that the inhibit time allows at `now` [s]."""
         while self._waiting and self._can_id is not None:
             if self._sent_at is not None and now - self._sent_at + EPSILON < self._inhibit:
                 return

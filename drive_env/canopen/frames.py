@@ -12,7 +12,7 @@ class Frame(NamedTuple):
         can_id: Identifier, 0...7FFh.
         data: 0...8 bytes; empty in a remote frame.
         rtr: Whether it is a remote frame.
-        dlc: Data length code of a remote frame; of others None, since it is the length of the data.
+        dlc: Data length code of a remote frame; None for other frames, whose data have that length.
     """
 
     can_id: int
@@ -50,7 +50,7 @@ IDENTIFIER = 0x7FF
 
 
 def service_name(can_id: int) -> str:
-    """Return the service and the node of an identifier in the predefined connection set; "" for one of no service."""
+    """Return the service and the node of an identifier in the predefined connection set; "" if it is of no service."""
     node = can_id & 0x7F
     if node == 0:
         return {NMT: "NMT", SYNC: "SYNC", TIME: "TIME"}.get(can_id, "")

@@ -1,7 +1,7 @@
-"""The two lamps of a node: run, which is green, and error, which is red (CiA 303-3).
+"""The two LEDs of a node: run, green, and error, red (CiA 303-3).
 
-Devices do not show what is not in the table: "triple flash" (SYNC error). While LSS configures a node, or waits to,
-both lamps flicker.
+Devices do not show patterns that are missing in the table: "triple flash" (SYNC error). While LSS configures a node or
+the node waits for it, both LEDs flicker.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from drive_env.canopen.nmt import NmtState
 
-# Seconds of light and darkness in turn, beginning with light; without any it is on or off for good.
+# Seconds on and off alternately, beginning with on; an empty pattern is permanently on or off.
 PATTERNS: dict[str, tuple[float, ...]] = {
     "off": (),
     "on": (),
@@ -30,7 +30,7 @@ WARNING_LIMIT = 96  # of the controller's error counter (ISO 11898-1)
 
 
 class Leds(NamedTuple):
-    """Patterns of both lamps, by name."""
+    """Patterns of both LEDs, by name."""
 
     run: str
     error: str
@@ -39,13 +39,13 @@ class Leds(NamedTuple):
 def leds_of(
     state: NmtState, is_bus_off: bool, conditions: Collection[Hashable], error_counter: int, is_lss: bool = False
 ) -> Leds:
-    """Return the lamps of a node; of several errors the gravest shows.
+    """Return the LEDs of a node; of several errors the most serious is shown.
 
     Args:
         state: NMT state.
         is_bus_off: Whether its controller has left the bus.
-        conditions: Errors that last: "guarding", ("heartbeat", node), others do not count.
-        error_counter: Of its controller.
+        conditions: Lasting errors; only "guarding" and ("heartbeat", node) count.
+        error_counter: Its controller's error counter.
         is_lss: Whether it has no node-ID, or LSS configures it.
     """
     if is_lss and not is_bus_off:
@@ -59,7 +59,7 @@ def leds_of(
 
 
 def is_lit(pattern: str, time: float) -> bool:
-    """Return whether a lamp with that pattern is lit at a time [s] since the pattern began."""
+    """Return whether an LED with that pattern is lit at a time [s] since the pattern began."""
     parts = PATTERNS[pattern]
     if not parts:
         return pattern == "on"

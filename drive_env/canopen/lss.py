@@ -1,8 +1,8 @@
 """The slave of the layer setting services: node-ID and bit rate over the bus, without a node-ID (CiA 305).
 
-A request goes in, the response comes out: eight bytes, or None without a response. The slave waits until the master
-switches it into configuration, all slaves at once or the one with an identity. What is configured is pending: a node-ID
-takes effect with the next reset, a bit rate when all activate it at once.
+A call takes a request and returns the response: eight bytes, or None. The slave waits until the master switches it to
+configuration, all slaves at once or the one with an identity. Configured values are pending: a node-ID takes effect
+with the next reset, a bit rate when all slaves activate it together.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ FASTSCAN_BEGINS = 0x80  # "bit checked" that begins a scan
 
 
 class LssIdentity(NamedTuple):
-    """The LSS address: 1018h, with 0 for an entry that a device lacks."""
+    """The LSS address: 1018h, with 0 for entries that a device lacks."""
 
     vendor: int
     product: int
@@ -68,25 +68,25 @@ class LssNode(Protocol):
         """Return its identity."""
 
     def active_node_id(self) -> int:
-        """Return the node-ID that it has now; 255 for none."""
+        """Return its present node-ID; 255 if it has none."""
 
     def pending_node_id(self) -> int:
-        """Return the node-ID that it will have."""
+        """Return its node-ID after the next reset."""
 
     def configure_node_id(self, node_id: int) -> None:
-        """Note a node-ID that the next reset gives it."""
+        """Store a pending node-ID for the next reset."""
 
     def configure_bit_rate(self, bit_rate: int) -> bool:
-        """Note a bit rate [kbit/s]; return whether the node has it."""
+        """Store a pending bit rate [kbit/s]; return whether the node has it."""
 
     def activate_bit_rate(self, delay: float) -> None:
-        """Fall silent, take the bit rate after `delay` [s], and be silent for as long again."""
+        """Fall silent, switch to the bit rate after `delay` [s], and stay silent for `delay` again."""
 
     def store(self) -> int:
         """Store the pending settings; return the error code."""
 
     def leave_configuration(self) -> None:
-        """Learn that the slave waits again: a node that had no node-ID and now has one boots."""
+        """Note that the slave waits again: a node that had no node-ID and now has one boots."""
 
 
 class LssSlave:
@@ -108,10 +108,10 @@ class LssSlave:
         self.reset()
 
     def reset(self) -> None:
-        """Wait, as after power-on."""
+        """Switch to waiting, as after power-on."""
         self.is_configuring = False
-        self._switch_stage = self._identify_stage = 0  # parts of the identity that were right so far
-        self._scanned: int | None = None  # part of the identity that the scan is at
+        self._switch_stage = self._identify_stage = 0  # number of parts of the identity that matched so far
+        self._scanned: int | None = None  # part of the identity that the scan has reached
 
     def request(self, data: bytes) -> bytes | None:
         """Return the response to a request; None if it is not a request of eight bytes."""
@@ -148,7 +148,7 @@ class LssSlave:
             self._node.leave_configuration()
 
     def _switch_selective(self, part: int, number: int) -> bytes | None:
-        """Compare a part of the identity; all four, in their order, are the slave's."""
+        """Compare a part of the identity; the slave is selected if all four match in their order."""
         if self.is_configuring:
             return None
         in_order = part in (0, self._switch_stage)
@@ -181,7 +181,7 @@ class LssSlave:
         return self._node.active_node_id() == UNCONFIGURED and self._node.pending_node_id() == UNCONFIGURED
 
     def _scan(self, number: int, bit: int, part: int, following: int) -> bytes | None:
-        """Answer where the bits of the identity down to `bit` are those of the number."""
+        """Answer if the identity's bits down to `bit` equal those of the number."""
         if self.is_configuring or not self._is_unconfigured():
             return None
         if bit == FASTSCAN_BEGINS:
@@ -191,7 +191,7 @@ class LssSlave:
             return None
         if (number ^ self._node.identity()[part]) >> bit:
             return None
-        if bit == 0:  # the whole number is right: on to the next one, behind the last one into configuration
+        if bit == 0:  # the whole part matches: go to the next one, after the last one to configuration
             self._scanned = following
             if following < part:
                 self._scanned = None

@@ -1,4 +1,4 @@
-"""The NMT slave: states, commands, and which services live in which state (CiA 301, 7.3.2)."""
+"""The NMT slave: states, commands, and the services active in each state (CiA 301, 7.3.2)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Command(IntEnum):
 
 
 class Services(NamedTuple):
-    """A row of CiA 301, table 37: the services of a state; NMT and error control work in all three."""
+    """A row of CiA 301, table 37: the active services of a state; NMT and error control work in all three."""
 
     sdo: bool
     pdo: bool
@@ -44,7 +44,7 @@ _COMMANDS = {int(command): command for command in Command}
 
 
 def parse_command(data: bytes, node_id: int) -> Command | None:
-    """Return the command of an NMT frame for this node: to all (0) or to it alone; None if it has no command for it."""
+    """Return the command of an NMT frame to all nodes (0) or this one; None if it has no command for it."""
     if len(data) != 2 or data[1] not in (0, node_id):
         return None
     return _COMMANDS.get(data[0])

@@ -1,7 +1,7 @@
-"""One CANopen node: frames come in, frames go out, and the drives behind it are the axes of one device.
+"""One CANopen node: receives and sends frames for the axes of one device.
 
-Here the services meet: which of them live in which NMT state, what a reset brings back, what an error does. Each
-service is a file of its own and knows nothing of the others. A node reads no clock: every call brings the time.
+This module connects the services: which are active in which NMT state, what a reset restores, what an error causes.
+Each service is a file of its own and knows nothing of the others. A node reads no clock: every call brings the time.
 """
 
 from __future__ import annotations
@@ -40,36 +40,38 @@ logger = logging.getLogger(__name__)
 
 COMMUNICATION_ERROR, APPLICATION_ERROR = 1, 2  # sub-indices of 1029h
 SEGMENT_BITS = 135  # of a frame of eight bytes with its stuff bits
-# Section of the store, and its keys, of what LSS has stored; there is no object of index 0.
+# Section of the store with LSS's settings, and their keys; no object has index 0.
 LSS_SECTION, LSS_NODE_ID, LSS_BIT_RATE = "lss", (0, 1), (0, 2)
 
 
 class Node:
-    """A CANopen slave in front of the axes of one emulated device.
+    """A CANopen slave with the axes of one emulated device.
 
     It is off until `power_on`.
 
     Args:
-        node_id: Number on the bus, 1...127; one that the store holds replaces it. 255 of a device with LSS: it has
-            none, and waits for one.
+        node_id: Number on the bus, 1...127; a stored one replaces it. 255 for a device with LSS: it has none, and waits
+            for one.
         drives: The emulated drives.
         first_axis: Number of the device's first axis among the drives'.
-        send: Takes every frame that the node sends.
-        store: The file that is its non-volatile memory; without one it lasts as long as the node.
-        bit_rate: That of the bus [bit/s], and the node's own while it has stored none. With another one stored the node
-            is mute and deaf, as its controller understands nothing. None: the factory's, and whatever is stored fits.
-        takes_time: Its firmware takes no more frames in a cycle than it can, the next wait in its receive buffer; from
-            an NMT reset to the boot-up message it needs the device's time, deaf and mute, and so does an SDO answer.
-        spare: Drives of the node's last axes, those that `drives` have none for.
-        has_room: Whether the controller's buffer takes another segment of a block upload.
-        serial: Serial number of a device whose data say where it stands; by default the node-ID.
+        send: Called with every frame that the node sends.
+        store: File of its non-volatile memory; None: memory that lasts as long as the node.
+        bit_rate: Bit rate of the bus [bit/s], and the node's own until it stores one. If it has stored another one, it
+            neither sends nor receives, since its controller understands nothing. None: the factory's, and any stored
+            one matches.
+        takes_time: Whether its firmware handles only as many frames per cycle as the device's does, while further ones
+            wait in its receive buffer, and whether booting (without sending or receiving) and SDO answers take the
+            device's time.
+        spare: Drives of the node's last axes if `drives` have too few.
+        has_room: Returns whether the controller's buffer accepts another segment of a block upload.
+        serial: Serial number, if the device's data name its object; by default the node-ID.
 
     Raises:
-        ValueError: For a number that no node can have, axes that the drives do not have, a bit rate that the device
-            does not know, or a file that holds something else.
+        ValueError: For an impossible node-ID, axes that the drives do not have, a bit rate that the device lacks, or a
+            file of another kind.
 
     Attributes:
-        node_id: Number on the bus, as it is now.
+        node_id: Present number on the bus.
         state: NMT state.
         drives: The emulated drives.
         first_axis: Number of the device's first axis among them.
@@ -99,7 +101,7 @@ class Node:
             )
         self._serial = node_id if serial is None else serial
         self._has_room = has_room
-        self._pending_node_id: int | None = None  # that LSS has configured since power-on
+        self._pending_node_id: int | None = None  # configured by LSS since power-on
         self._pending_bit_rate: int | None = None  # kbit/s
         self._activated_bit_rate: int | None = None
         self._clock = Clock()
@@ -138,7 +140,7 @@ class Node:
         self._empty_buffers(takes_time)
 
     def _commissioned(self) -> dict[str, Section]:
-        """Return the section of communication as the drives were commissioned; {} where that is the factory's."""
+        """Return the stored communication section of the drives as commissioned; {} if that is the factory's."""
         found: Section = {}
         for entry in self._objects.entries:
             if entry.index in communication.COMMUNICATION and entry.access in ("rw", "rwr", "rww") and entry.bits:
@@ -153,17 +155,17 @@ class Node:
         self._frames_left = self._frames_per_cycle = device.canopen.frames_per_cycle if takes_time else math.inf
         self._takes_time = takes_time
         self._boot_time = device.canopen.boot_time if takes_time else 0.0
-        self._boots_at: float | None = None  # while it boots
+        self._boots_at: float | None = None  # end of the boot time; None unless it boots
         self._boot: Callable[[float], None] = self._reset_communication
-        self._answers: deque[tuple[float, Frame]] = deque()  # of SDO and LSS, and when they are ready [s]
-        self._segment_at = math.inf  # when the next segment of a block upload may go [s]
+        self._answers: deque[tuple[float, Frame]] = deque()  # of SDO and LSS, with their sending times [s]
+        self._segment_at = math.inf  # when the next segment of a block upload may be sent [s]
         self._work = 0.0  # s that the present request takes
-        self._received: deque[tuple[Frame, float]] = deque()  # and when they came [s]
-        self._came = 0.0  # when the frame under way came [s]
+        self._received: deque[tuple[Frame, float]] = deque()  # with their times of reception [s]
+        self._came = 0.0  # time of reception of the frame being handled [s]
         self._has_lost = False  # frames, since its receive buffer was last half empty
 
     def _make_services(self, indices: Sequence[int]) -> None:
-        """Make SDO server, emergencies, error control and the PDOs of the dictionary's indices."""
+        """Create SDO server, emergencies, error control and the PDOs of the dictionary's indices."""
         device = self._device
         services = device.canopen.services
         self._sdo = SdoServer(
@@ -197,7 +199,7 @@ class Node:
         self._reset_application(now)
 
     def receive(self, frame: Frame, now: float) -> None:
-        """Take a frame of the bus at time `now` [s]; whatever it holds, nothing is raised."""
+        """Receive a frame of the bus at time `now` [s]; no content raises an exception."""
         self._now = now
         if not self._is_online or not self._accepts(frame):
             return
@@ -213,18 +215,18 @@ class Node:
 
     @property
     def sync_id(self) -> int:
-        """Identifier of SYNC: 1005h, or that of CiA 301 on a drive without it."""
+        """Identifier of SYNC: 1005h, or that of CiA 301 for a drive without 1005h."""
         module = self._module
         has_it = module.has(communication.SYNC_ID)
         return module.value(communication.SYNC_ID) & frames.IDENTIFIER if has_it else frames.SYNC
 
     @property
     def next_answer(self) -> float:
-        """When its next SDO answer, or segment of one, is ready [s]; infinite while none is under way."""
+        """Time of its next SDO answer, or segment of one [s]; inf if there is none."""
         return min(self._answers[0][0], self._segment_at) if self._answers else self._segment_at
 
     def answer(self, now: float) -> None:
-        """Send the SDO answers that are ready at `now` [s]."""
+        """Send the SDO answers that are due at `now` [s]."""
         self._now = now
         while self._answers and self._answers[0][0] <= now + EPSILON:
             self._transmit(self._answers.popleft()[1])
@@ -232,7 +234,7 @@ class Node:
             self._send_segments(now)
 
     def _send_segments(self, now: float) -> None:
-        """Send segments of a block upload: a controller's buffer is filled no further than half."""
+        """Send segments of a block upload, filling the controller's buffer at most half."""
         while self._has_room():
             segment = self._sdo.next_segment(now)
             if segment is None:
@@ -245,7 +247,7 @@ class Node:
 
     @property
     def _segment_time(self) -> float:
-        """Time from a segment to the next [s]: neither its firmware nor its bus is faster."""
+        """Time between two segments [s], limited by its firmware and the bus."""
         if not self._takes_time:
             return 0.0
         return max(self._device.canopen.sdo_time, SEGMENT_BITS / (1e3 * (self._bit_rate or 1000)))
@@ -257,7 +259,7 @@ class Node:
         return frame.can_id in self._handlers
 
     def _take(self, frame: Frame, now: float) -> None:
-        if frame.rtr:  # the device supports remote frames for guarding alone
+        if frame.rtr:  # the device supports remote frames only for guarding
             if self._heartbeat.period == 0.0:
                 self._transmit(Frame(frame.can_id, self._guarding.answer(self.state, now)))
                 self._errors.conditions.pop("guarding", None)
@@ -266,9 +268,9 @@ class Node:
             handler(frame.data, now)
 
     def before_cycle(self, now: float) -> None:
-        """Run everything due before the drives advance by one communication cycle that begins at `now` [s].
+        """Run everything due before the drives advance by a communication cycle that begins at `now` [s].
 
-        A lost master so stops the drives in the cycle that begins.
+        So a lost master stops the drives already in this cycle.
         """
         self._now = now
         if self._boots_at is not None and now >= self._boots_at - EPSILON:
@@ -292,8 +294,8 @@ class Node:
         self._produce(now)
 
     def _produce(self, now: float) -> None:
-        """Send SYNC and TIME where this node makes them and they are due; its own SYNC is one to it, too."""
-        if not nmt.SERVICES[self.state].sdo:  # they live where SDO lives, and error control has its own times
+        """Send SYNC and TIME when this node produces them and they are due; the node itself reacts to its SYNC, too."""
+        if not nmt.SERVICES[self.state].sdo:  # active when SDO is; error control has its own times
             return
         if self._time_producer.is_due(now):
             raw = self._module.value(communication.TIME_ID)
@@ -305,7 +307,7 @@ class Node:
             self._on_sync(data, now)
 
     def after_cycle(self, now: float) -> None:
-        """Run everything due after it: emergencies, event-driven PDOs, timers, heartbeat; it ended at `now` [s]."""
+        """Run everything due after a cycle, which ended at `now` [s]: emergencies, PDOs, timers, heartbeat."""
         self._now = now
         if not self._is_online:
             return
@@ -324,7 +326,7 @@ class Node:
 
     @property
     def saves_lose_power(self) -> bool:
-        """Whether the power fails, and comes back, in the middle of each save (1010h, 2706h); set likewise."""
+        """Whether the power fails and returns in the middle of each save (1010h, 2706h); can be set."""
         return self._store.loses_power
 
     @saves_lose_power.setter
@@ -332,7 +334,7 @@ class Node:
         self._store.loses_power = value
 
     def leds(self, error_counter: int = 0) -> Leds:
-        """Return its lamps; `error_counter` is its controller's."""
+        """Return its LEDs; `error_counter` is its controller's."""
         boots = self.state is NmtState.INITIALISING
         is_lss = self.node_id == UNCONFIGURED or (self._lss is not None and self._lss.is_configuring)
         return leds_of(self.state, not self._is_online and not boots, self._errors.conditions, error_counter, is_lss)
@@ -355,7 +357,7 @@ class Node:
         self._react(COMMUNICATION_ERROR)
 
     def bus_on(self, now: float) -> None:
-        """Let the controller recover from bus-off; the node tells it as soon as its NMT state allows."""
+        """Recover the controller from bus-off; the node reports it as soon as its NMT state allows."""
         self._now = now
         if self._is_online or self._boots_at is not None or self.state is NmtState.INITIALISING:
             return
@@ -363,25 +365,25 @@ class Node:
         self._errors.condition("bus_off_recovered", now)
 
     def overrun(self, now: float, buffer: str = "controller") -> None:
-        """Tell it that frames were lost in a buffer: "controller", "transmit" or "receive"."""
+        """Report that frames were lost in a buffer: "controller", "transmit" or "receive"."""
         self._now = now
         self._errors.condition(f"{buffer}_overflow", now)
 
     def error_passive(self, now: float) -> None:
-        """Tell it that its controller has become error passive."""
+        """Report that its controller has become error passive."""
         self._now = now
         self._errors.condition("error_passive", now)
 
     # --- resets ---------------------------------------------------------------------------------------------------
     def _reset_application(self, now: float) -> None:
-        """Start the module anew: bit rate and node ID that were stored, the axes' stored values, then communication."""
+        """Restart the module: stored bit rate and node-ID, the axes' stored values, then communication."""
         self._restore_bus()
         self._take_bit_rate("stored")
         self._axes.restart()
         self._reset_communication(now)
 
     def _take_bit_rate(self, origin: str) -> None:
-        """Be on the bus if its bit rate is the node's."""
+        """Be on the bus only if its bit rate is the node's."""
         self._is_online = self._bus_bit_rate in (None, self.bit_rate)
         if not self._is_online:
             logger.warning(
@@ -391,9 +393,9 @@ class Node:
             )  # fmt: skip
 
     def _restore_bus(self) -> None:
-        """Let bit rate and node ID that were stored become the active ones; never stored, they are the given ones."""
+        """Activate the stored bit rate and node-ID; the given ones if none were stored."""
         objects, bus = self._device.canopen.objects, self._store.sections.get("bus")
-        by_lss = self._store.sections.get(LSS_SECTION, {})  # stored later than "bus", which forgets it
+        by_lss = self._store.sections.get(LSS_SECTION, {})  # stored later than "bus", since storing "bus" deletes it
         factory = self._module.factory(self._factory_id)
         active = {"bit_rate": self._bus_bit_rate or 0, "node_id": self._given_id}
         for role, given, lss_key in (
@@ -401,7 +403,7 @@ class Node:
             ("node_id", self._given_id, LSS_NODE_ID),
         ):
             key = objects.get(role)
-            if key is None:  # a device that keeps neither has what it was given
+            if key is None:  # a device that stores neither uses the given ones
                 active[role] = by_lss.get(lss_key, active[role])
                 continue
             raw = given if bus is None and given is not None else (bus or {}).get(key, factory[key])
@@ -417,11 +419,11 @@ class Node:
 
     @property
     def _factory_id(self) -> int:
-        """Node-ID of the factory's COB-IDs; of a node that has none it is of no account."""
+        """Node-ID in the factory's COB-IDs; without a node-ID any value serves."""
         return 1 if self._given_id == UNCONFIGURED else self._given_id
 
     def _take_pending_node_id(self) -> bool:
-        """Let a node-ID that LSS has configured be the node's; return whether it was another one."""
+        """Activate a node-ID that LSS has configured; return whether it differs from the present one."""
         before = self.node_id
         if self._pending_node_id is not None:
             self.node_id = self._pending_node_id
@@ -430,13 +432,13 @@ class Node:
         return self.node_id != before
 
     def _reset_communication(self, now: float) -> None:
-        """Bring the communication objects back, send the boot-up message and become pre-operational.
+        """Restore the communication objects, send the boot-up message and become pre-operational.
 
-        A node without a node-ID does not: it waits for LSS to give it one.
+        A node without a node-ID does not boot: it waits for LSS to give it one.
         """
         self.state = NmtState.INITIALISING
         if self._take_pending_node_id():
-            # The master that commanded and watched it does not know it by its new number.
+            # The master that monitored it does not know its new number.
             self._axes.trip()
         self._leaves_for_bootloader = False
         self._received.clear()
@@ -467,7 +469,7 @@ class Node:
         self.state = NmtState.PRE_OPERATIONAL
 
     def _wait_for_node_id(self) -> None:
-        """Listen to LSS alone, and produce nothing."""
+        """Listen only to LSS, and send nothing."""
         self._heartbeat.configure(0.0)
         self._guarding.configure(0.0)
         self._sync_producer.configure(0.0, 0)
@@ -476,7 +478,7 @@ class Node:
         self._handlers = {lss.REQUEST: (self._on_lss,)}
 
     def _configure(self, index: int) -> None:
-        """Have the service behind a communication object read its written value."""
+        """Make the service of a communication object read its written value."""
         module = self._module
         if index in (communication.EMERGENCY_ID, communication.EMERGENCY_INHIBIT):
             raw = module.value(communication.EMERGENCY_ID)
@@ -505,7 +507,7 @@ class Node:
         self._connect()
 
     def _connect(self) -> None:
-        """Work out which services take which identifier; several may share one."""
+        """Assign identifiers to services; several services may share one."""
         table: dict[int, list[Callable[[bytes, float], None]]] = {
             frames.NMT: [self._on_nmt],
             frames.SDO_REQUEST + self.node_id: [self._on_sdo],
@@ -545,7 +547,7 @@ class Node:
             self._restart(self._reset_communication, now)
 
     def _restart(self, boot: Callable[[float], None], now: float) -> None:
-        """Boot, now or after the time that it takes."""
+        """Boot, now or after its boot time."""
         if self._boot_time == 0.0:
             boot(now)
             return
@@ -570,7 +572,8 @@ class Node:
                 sent.start()
         elif state is NmtState.STOPPED:
             self._close_sdo()
-            # The one link between the two automata (manual, section 2.2). A stop after an error has been told already.
+            # The only link between the two state machines (manual, section 2.2). A stop after an error is already
+            # reported.
             if self._axes.trip(told) and is_commanded:
                 self._errors.condition(told, self._now)
 
@@ -592,13 +595,13 @@ class Node:
         if self._sdo.block is not None:
             self._send_segments(now)
         if self._leaves_for_bootloader:
-            # The boot loader does not speak CANopen, and under it no firmware drives the motor: until power-on.
+            # The boot loader has no CANopen, and no firmware drives the motor: until power-on.
             self._is_online = False
             self.state = NmtState.INITIALISING
             self._axes.restart()
 
     def _answer(self, frame: Frame, now: float) -> None:
-        """Send an answer, now or after the time that it takes."""
+        """Send an answer, now or after its processing time."""
         if not self._takes_time:
             self._transmit(frame)
             return
@@ -606,7 +609,7 @@ class Node:
         self._answers.append((begins + self._work, frame))
 
     def _close_sdo(self) -> None:
-        """Forget an open transfer, and the answers that are under way."""
+        """Forget an open transfer, and its pending answers."""
         self._sdo.close()
         self._clear_answers()
 
@@ -643,7 +646,7 @@ class Node:
         self._window.open(self._came)
         for received in self._sync_rpdos:
             self._judge(received, received.latch(), now)
-        if self._window.is_over(now):  # so late was it looked at
+        if self._window.is_over(now):  # it was handled too late
             return
         counter = data[0] if data else None
         for sent in self._sync_tpdos:
@@ -667,7 +670,7 @@ class Node:
 
     # --- errors ---------------------------------------------------------------------------------------------------
     def _judge(self, pdo: ReceivePdo, condition: str | None, now: float) -> None:
-        """Tell of a PDO that could not be processed, once until a good one comes (CiA 301: once per error event)."""
+        """Report a PDO that could not be processed, once until a good one comes (CiA 301: once per error event)."""
         if condition is not None:
             self._errors.condition(condition, now, pdo.index)
         elif pdo.index in self._errors.conditions:
@@ -678,7 +681,7 @@ class Node:
         self._react(COMMUNICATION_ERROR, "heartbeat_lost")
 
     def _react(self, error_class: int, told: str = COMMUNICATION) -> None:
-        """Change the NMT state as 1029h says for an error that is detected in operational."""
+        """Change the NMT state according to 1029h after an error detected in operational."""
         if self.state is not NmtState.OPERATIONAL:
             return
         raw = self._module.value(communication.ERROR_BEHAVIOUR, error_class)
@@ -696,7 +699,7 @@ class Node:
 
     # --- store, restore, boot loader ------------------------------------------------------------------------------
     def _add_services(self) -> None:
-        """Put the services behind the objects whose value they are, or whose write commands them."""
+        """Connect the services to the objects that show or command them."""
         module, canopen = self._module, self._device.canopen
         self._errors.add_objects(module)
         self._parameters.add_commands()
@@ -715,7 +718,7 @@ class Node:
         module.commands[communication.TIME_STAMP, 0] = lambda raw: self._clock.set_microseconds(raw, self._came)
 
     def _eds_text(self) -> str:
-        """Return the content of 1021h, each byte a character: the EDS as it is, which 1022h says is not compressed."""
+        """Return the content of 1021h, each byte as a character: the EDS, uncompressed as 1022h says."""
         return eds_text(self._device.eds).encode().decode("latin-1")
 
     def _leave_for_bootloader(self) -> None:
@@ -739,26 +742,26 @@ class Node:
 
     # --- what LSS asks for (drive_env/canopen/lss.py) -----------------------------------------------------------------
     def identity(self) -> LssIdentity:
-        """Return vendor, product, revision and serial number; 0 for one that the device lacks."""
+        """Return vendor, product, revision and serial number; 0 for those that the device lacks."""
         has = self._module.subs(IDENTITY)
         port = self.dictionary.port
         parts = [port(IDENTITY, sub).read() if sub in has else 0 for sub in (1, 2, 3, 4)]
         return LssIdentity(*(part if isinstance(part, int) else 0 for part in parts))
 
     def active_node_id(self) -> int:
-        """Return its node-ID, 255 for none."""
+        """Return its node-ID; 255 if it has none."""
         return self.node_id
 
     def pending_node_id(self) -> int:
-        """Return the node-ID that it has after the next reset."""
+        """Return its node-ID after the next reset."""
         return self.node_id if self._pending_node_id is None else self._pending_node_id
 
     def configure_node_id(self, node_id: int) -> None:
-        """Note the node-ID of after the next reset."""
+        """Store the node-ID for the next reset."""
         self._pending_node_id = node_id
 
     def configure_bit_rate(self, bit_rate: int) -> bool:
-        """Note a bit rate [kbit/s], if the device has it."""
+        """Store a pending bit rate [kbit/s], if the device has it."""
         try:
             known_bit_rate(self._device, 1000 * bit_rate)
         except ValueError:
@@ -769,15 +772,15 @@ class Node:
         return True
 
     def activate_bit_rate(self, delay: float) -> None:
-        """Stop the axes and fall silent; have the pending bit rate after `delay` [s], and speak after as long again."""
+        """Stop the axes and fall silent; use the pending bit rate after `delay` [s], send again after twice that."""
         if self._pending_bit_rate is None:
             return
-        self._axes.trip()  # no master can stop them over a bus whose nodes change their bit rate
+        self._axes.trip()  # no master can stop them on a bus whose nodes change their bit rate
         self._is_online = False
         self._received.clear()
         self._close_sdo()
         self._activated_bit_rate = self._pending_bit_rate
-        if self._takes_time:  # in lockstep nothing does
+        if self._takes_time:  # in lockstep it takes no time
             self._boots_at, self._boot = self._now + 2.0 * delay, self._change_bit_rate
         else:
             self._change_bit_rate(self._now)
@@ -790,7 +793,7 @@ class Node:
         self._take_bit_rate("by LSS")
 
     def store(self) -> int:
-        """Store node-ID and bit rate as they are pending."""
+        """Store the pending node-ID and bit rate."""
         services = self._device.canopen.services
         if not services.lss_stores:
             return lss.STORE_UNSUPPORTED

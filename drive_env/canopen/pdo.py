@@ -1,4 +1,4 @@
-"""PDOs: which are received and sent, when, and under which identifier (CiA 301, 7.2.2)."""
+"""PDOs: receiving and sending, transmission types, identifiers (CiA 301, 7.2.2)."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Pdo:
 
     @property
     def is_synchronous(self) -> bool:
-        """Whether it belongs to SYNC."""
+        """Whether it is synchronous (SYNC)."""
         return self.transmission_type <= LAST_SYNCHRONOUS
 
 
@@ -55,7 +55,7 @@ class ReceivePdo(Pdo):
         self._waiting: bytes | None = None
 
     def receive(self, data: bytes) -> str | None:
-        """Take a frame; return the condition that it makes, None if it is good."""
+        """Handle a frame; return the error condition that it causes, None if it is good."""
         if len(data) != self._mapped.size:
             return "pdo_too_short" if len(data) < self._mapped.size else "pdo_too_long"
         if self.is_synchronous:
@@ -64,7 +64,7 @@ class ReceivePdo(Pdo):
         return self._apply(data)
 
     def latch(self) -> str | None:
-        """Let data received since the last SYNC take effect; return the error condition, if it makes one."""
+        """Apply the data received since the last SYNC; return the error condition that they cause, or None."""
         if self._waiting is None:
             return None
         data, self._waiting = self._waiting, None
@@ -81,10 +81,10 @@ class ReceivePdo(Pdo):
 class TransmitPdo(Pdo):
     """A PDO that the drive sends.
 
-    Event-driven ones (254, 255) are sent when a mapped value has changed since the last look, once per communication
-    cycle, and when their event timer ends; so is one when the node becomes operational, since its values are unknown
-    then. Synchronous ones are sampled at SYNC: type n at every n-th, type 0 if a value has changed since the last;
-    event timer and inhibit time are not theirs (CiA 301, 1800h).
+    Event-driven ones (254, 255) are sent when a mapped value has changed, at most once per communication cycle, when
+    their event timer ends, and when the node becomes operational, since its values are unknown then. Synchronous ones
+    are sampled at SYNC: type n at every n-th, type 0 if a value has changed since the last; event timer and inhibit
+    time do not apply to them (CiA 301, 1800h).
     """
 
     def __init__(
@@ -108,10 +108,10 @@ class TransmitPdo(Pdo):
         self._start_value = self._objects.value(self.index, 6)
         self.start()
         if self.can_id is not None and self.can_id == before[0]:
-            self._sent_at = before[1]  # the inhibit time of a PDO that stays on runs on
+            self._sent_at = before[1]  # the inhibit time of a PDO that stays on continues
 
     def start(self) -> None:
-        """Begin anew, as on entering operational."""
+        """Restart, as on entering operational."""
         self._seen: bytes | None = None
         self._is_due = False
         self._sent_at = None
@@ -119,11 +119,11 @@ class TransmitPdo(Pdo):
         self._waits_for_start = self._start_value != 0
 
     def on_sync(self, counter: int | None = None) -> bytes | None:
-        """Return the data to send at this SYNC, None if there is nothing to send.
+        """Return the data to send at this SYNC, or None.
 
         Args:
-            counter: The count in the SYNC, None without one; the one with the SYNC start value (1800h:06) is the
-                first.
+            counter: The count in the SYNC, None without one; the first counted SYNC is the one with the SYNC start
+                value (1800h:06).
         """
         if not self.is_synchronous or not len(self._mapped):
             return None
@@ -142,7 +142,7 @@ class TransmitPdo(Pdo):
         return self._mapped.pack()
 
     def on_cycle(self, now: float) -> bytes | None:
-        """Return the data to send after a communication cycle that ended at `now` [s]."""
+        """Return the data to send after a communication cycle that ended at `now` [s], or None."""
         if self.is_synchronous or not len(self._mapped):
             return None
         data = self._mapped.pack()

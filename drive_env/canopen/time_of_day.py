@@ -1,4 +1,4 @@
-"""TIME: the time of day on the bus, consumed and produced, and the clock that it sets (CiA 301, 1012h and 1013h).
+"""TIME: the time of day on the bus, received and sent, and the clock that it sets (CiA 301, 1012h and 1013h).
 
 TIME_OF_DAY is six bytes: 28 bits of milliseconds after midnight, four that are reserved, 16 bits of days since
 1 January 1984. 1013h counts microseconds and wraps round after 2^32 of them, some 72 minutes.
@@ -30,12 +30,12 @@ class Clock:
     """A node's clock: it runs from power-on, where it shows the beginning of 1984, and is set over the bus."""
 
     def __init__(self) -> None:
-        self._zero = 0.0  # when it showed the beginning of 1984 [s]
+        self._zero = 0.0  # when it was at the beginning of 1984 [s]
         self._high_resolution_zero = 0.0
         self.is_set = False
 
     def power_on(self, now: float) -> None:
-        """Begin to run: it has no battery."""
+        """Start the clock at the beginning of 1984: it has no battery."""
         self._zero = self._high_resolution_zero = now
         self.is_set = False
 
@@ -62,7 +62,7 @@ class Clock:
 
 
 class TimeProducer:
-    """When to send TIME.
+    """Decides when to send TIME.
 
     Args:
         period: Seconds between two of them.
@@ -74,12 +74,12 @@ class TimeProducer:
         self._is_on = False
 
     def configure(self, is_on: bool) -> None:
-        """Begin or end; the first comes at once."""
+        """Switch on or off; the first TIME is due at once."""
         if is_on is not self._is_on:
             self._is_on, self._next = is_on, None
 
     def is_due(self, now: float) -> bool:
-        """Return whether one is due at `now` [s], and count on."""
+        """Return whether TIME is due at `now` [s], and schedule the next."""
         if not self._is_on or (self._next is not None and now < self._next - EPSILON):
             return False
         self._next = max((now if self._next is None else self._next) + self._period, now)

@@ -79,7 +79,7 @@ def _pcapng(content: Any) -> Iterator[tuple[float, int, bytes]]:
         if not order:
             raise LogError("it does not begin as a .pcapng does; is its ending right?")
         kind, length = struct.unpack(order + "II", head)
-        body = _exactly(content, max(_checked(length) - 8, 4))[:-4]  # the length stands at the end once more
+        body = _exactly(content, max(_checked(length) - 8, 4))[:-4]  # the length is repeated at the end
         if kind == INTERFACE:
             interfaces.append((struct.unpack(order + "H", body[:2])[0], _time_unit(order, body[8:])))
         elif kind == SIMPLE_PACKET:
@@ -93,7 +93,7 @@ def _pcapng(content: Any) -> Iterator[tuple[float, int, bytes]]:
 
 
 def _time_unit(order: str, options: bytes) -> float:
-    """Return the unit of an interface's times [s]: of its options, or microseconds."""
+    """Return the unit of an interface's times [s]: from its options, by default microseconds."""
     while len(options) >= 4:
         code, length = struct.unpack(order + "HH", options[:4])
         if code == TIME_RESOLUTION and length == 1:

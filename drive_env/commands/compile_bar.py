@@ -12,9 +12,9 @@ from drive_env.commands.progress import progress_on, shown
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
-KERNELS = "mechanics.kernels.kernel_files"  # who logs what is compiled
-# Functions that Numba compiles for a kernel, its stages included, if those above were compiled before. Whatever runs
-# drives takes the first three.
+KERNELS = "mechanics.kernels.kernel_files"  # logger of compilations
+# Number of functions that Numba compiles for a kernel, including its stages, after those above. Programs that run
+# drives need the first three.
 FUNCTIONS = {
     "cycle.power_on": 24, "cycle.write_events": 54, "cycle.run": 107, "prepared_record.from_od": 2,
     "prepared_record.to_od": 2, "tracking_cycle.describe_lanes": 3, "tracking_cycle.act": 5,
@@ -36,13 +36,13 @@ def show_compiling() -> CompileBar:
 
 
 class CompileBar(logging.Handler):
-    """Shows the log of `kernel_files`: lines as they are, kernels as a bar whose parts are functions."""
+    """Shows the log of `kernel_files`: lines unchanged, kernels as a progress bar over functions."""
 
     def __init__(self) -> None:
         super().__init__()
         self.done = self.total = 0
         self._needed: set[str] = set()
-        self._own: Progress | None = None  # made where no other bars are
+        self._own: Progress | None = None  # created if no other bars are shown
         self._bars: Progress | None = None
         self._task: TaskID | None = None
 
@@ -51,7 +51,7 @@ class CompileBar(logging.Handler):
         from mechanics.kernels.kernel_files import COMPILED, COMPILING
 
         if record.levelno > logging.DEBUG:
-            if not logging.getLogger().handlers:  # with --verbose the log has it
+            if not logging.getLogger().handlers:  # with --verbose the log contains it
                 print(record.getMessage(), file=sys.stderr, flush=True)
         elif sys.stderr.isatty() and record.msg == COMPILING:
             self._begin(str(record.args[0]).partition("-")[0] if isinstance(record.args, tuple) else "")
@@ -78,7 +78,7 @@ class CompileBar(logging.Handler):
         bars = next((one for one in reversed(shown) if one.console.is_terminal), self._own)
         if bars is not self._bars or self._task is None:
             self._bars, self._task = bars, bars.add_task("compiling, once", total=self.total)
-        # Kernel after kernel it is the same bar, which goes on counting the time.
+        # One bar for all kernels, which keeps counting the time.
         bars.update(self._task, completed=self.done, total=self.total, visible=True)
         if bars is self._own:
             bars.start()
@@ -93,4 +93,4 @@ class CompileBar(logging.Handler):
         from mechanics.kernels.compiled import call_after_each_function
 
         call_after_each_function(self.count)
-        atexit.register(self._end)  # a terminal gets its cursor back, whatever ends the program
+        atexit.register(self._end)  # restores a terminal's cursor, however the program ends

@@ -59,7 +59,7 @@ def _steps(devices: list[str]) -> dict[str, Callable[[], None]]:
     """Return the steps that compile the kernels of devices, by their titles on the progress bar.
 
     Raises:
-        ValueError: There is no such device.
+        ValueError: For an unknown device.
     """
     from drive_env.devices import find_device
 
@@ -68,7 +68,7 @@ def _steps(devices: list[str]) -> dict[str, Callable[[], None]]:
 
 
 def _use_drives(device: str) -> None:
-    """Run emulated drives as every program does, on a bus, too; the third call of `record` is a prepared one."""
+    """Run emulated drives like other programs, also on a bus; the third call of `record` is a prepared one."""
     from drive_env import EmulatedDrives, motion
     from drive_env.bus.world import World
 

@@ -1,4 +1,4 @@
-"""`drive-env export`: files by which other programs know a drive, EDS, DCF and ESI, or simulate it, FMU."""
+"""`drive-env export`: files for other programs: EDS, DCF and ESI to describe a drive, FMU to simulate it."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def export() -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class CommissionedOptions(NodeOptions):
-    """Options of a commissioned drive: one on a bus, or an emulated one."""
+    """Options of a commissioned drive, on a bus or emulated."""
 
     axis: AxisOfNode = None
     eds: Eds = None
@@ -78,7 +78,7 @@ def export_eds(context: typer.Context, file: File, *, drive: CommissionedOptions
         else:
             device = find_device(drive.device)
             own, other = ([(one.index, one.sub) for one in of.new_dictionary()] for of in (device, described(device)))
-            # Of the same objects there is one file, as its maker has it.
+            # For the same objects there is one file, the maker's.
             _write(file, eds_text((described(device) if own == other else device).eds), f"EDS of {drive.device}")
 
 
@@ -180,7 +180,6 @@ def _check_name(file: Path, ending: str) -> None:
 
 
 def _write(file: Path, text: str, said: str) -> None:
-    """Write a file and say of what it is, or print it."""
     from drive_env.whole_file import write_whole
 
     if str(file) == "-":

@@ -13,7 +13,7 @@ from drive_env.commands.tables import print_lines
 if TYPE_CHECKING:
     from drive_env.faults.table import FaultRow
 
-CONTROL_PORT = 29637  # of bus/fault_control.py, whose import takes long
+CONTROL_PORT = 29637  # copy of the one in bus/fault_control.py, whose import takes long
 
 
 def fault(
@@ -69,7 +69,7 @@ def fault(
             ]
             words += [f"when={when}"] if when else []
             line = shlex.join(words)
-            order = parse_order(line)  # a mistake in it is reported here, with or without a server
+            order = parse_order(line)  # mistakes in it are reported here, with or without a server
             checked_parameters(find_fault(order.name), order.parameters)
             number = ask(control, f"fault {line}")["number"]
             print_json({"number": number}) if as_json else print(number)

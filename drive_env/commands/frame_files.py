@@ -8,16 +8,16 @@ from typing import Any
 
 from drive_env.whole_file import naming
 
-# Beside an identifier, and of an error frame (linux/can.h, linux/can/error.h).
+# Flags of an identifier, and of an error frame (linux/can.h, linux/can/error.h).
 EXTENDED, REMOTE, ERROR, BUS_ERROR = 1 << 31, 1 << 30, 1 << 29, 0x80
 BIT_RATE_SWITCH, ERROR_STATE, FD = 0x01, 0x02, 0x04  # of CAN FD
-ERROR_DATA = bytes(8)  # an error frame carries what was wrong, which python-can does not hand on
+ERROR_DATA = bytes(8)  # the details of an error frame, which python-can does not pass on
 
 # pcap (draft-ietf-opsawg-pcap): magic of microseconds, version 2.4, longest record, link type.
 LINKTYPE_CAN_SOCKETCAN = 227
 PCAP_HEADER = struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 65_535, LINKTYPE_CAN_SOCKETCAN)
 RECORD = struct.Struct("<IIII")  # seconds, microseconds, length kept, length of the frame
-FRAME = struct.Struct(">IBBBB")  # identifier with flags (big-endian whatever the rest is), length, FD flags, reserved
+FRAME = struct.Struct(">IBBBB")  # identifier with flags (always big-endian), length, FD flags, reserved
 
 
 def candump_line(message: Any) -> bytes:
@@ -37,7 +37,7 @@ def candump_line(message: Any) -> bytes:
 
 
 def _packet(message: Any) -> bytes:
-    """Return a packet of link type 227: where a frame came from, for which it has no field, is left out."""
+    """Return a packet of link type 227, which has no field for a frame's source."""
     if message.is_error_frame:
         can_id, data, length = ERROR | BUS_ERROR, ERROR_DATA, len(ERROR_DATA)
     else:
@@ -83,7 +83,7 @@ def _fd_flags(message: Any) -> int:
 PCAPNG_HEADER = _block(0x0A0D0D0A, struct.pack("<IHHq", 0x1A2B3C4D, 1, 0, -1)) + _block(
     1, struct.pack("<HHI", LINKTYPE_CAN_SOCKETCAN, 0, 65_535)
 )
-# Ending -> what a file begins with, and what a frame becomes in it.
+# Ending -> the beginning of a file, and the function that converts a frame.
 FRAME_FILES = {
     ".log": (b"", candump_line),
     ".pcap": (PCAP_HEADER, pcap_record),
@@ -92,10 +92,10 @@ FRAME_FILES = {
 
 
 class FrameFile:
-    """A new file of frames, by its ending one of FRAME_FILES.
+    """A new file of frames, whose ending selects one of FRAME_FILES.
 
     Args:
-        path: Where.
+        path: The file.
     """
 
     def __init__(self, path: Path) -> None:

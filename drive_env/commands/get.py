@@ -95,7 +95,7 @@ def set_object(
         entry = drives.description.dictionary.find(object_name(name))
         chosen = axes_of(drives, entry, bus.axis)
         is_controlword = cia402.of_first_axis(entry.index) == cia402.CONTROLWORD
-        # A controlword has no unit, and one that stops is not kept waiting for what one would need.
+        # A controlword has no unit, and one that stops must not wait for the scales.
         scales = [None] * drives.num_axes if raw or is_controlword else scales_of(drives)
         wanted: list[Any] = [value] * drives.num_axes
         if drives.description.is_number(entry):
@@ -124,7 +124,7 @@ def set_object(
                 print(f"{axis_name(drives, k)}  {entry.label} = {_text(found[k], entry, scales[k], raw)}")
         asked = _without_remote_frames(entry, [wanted[k] for k in chosen], [found[k] for k in chosen])
         differs = readable and any(found[k] != one for k, one in zip(chosen, asked, strict=True))
-        # Stores and the like take a signature and read something else.
+        # Objects such as 1010h take a signature and read another value.
         if differs and not command(entry.index, drives.description.hints).endswith("a service"):
             fail(f"{entry.label} was written, but reads back another value than {asked[0]}", REFUSED)
 
@@ -140,7 +140,7 @@ def _tell_plan(
     raw: bool,
     json: bool,
 ) -> None:
-    """Print the present values and those to write; raises for a value that the object cannot take."""
+    """Print the present values and those to write; raises for an impossible value."""
     from drive_env.dictionary.access import check_limits, check_writable
 
     check_writable(entry)
@@ -164,7 +164,7 @@ def _tell_plan(
 
 
 def _refuse_to_enable(entry: Any, controlword: int) -> None:
-    """Raise ValueError for a controlword that would enable: this command ends, and nothing watches then."""
+    """Raise ValueError for a controlword that would enable: after this command nothing monitors the motor."""
     if cia402.may_enable(controlword):
         raise ValueError(
             f"{entry.label} = {controlword} would enable the axis, and nothing would monitor the motor after this "
@@ -178,7 +178,7 @@ def _bring_to_rest(drives: BusDrives, chosen: list[int]) -> None:
     from drive_env.master.can_drives import CanDrives
 
     if not isinstance(drives, CanDrives):
-        return  # on EtherCAT motors run in Op alone, and who opens the drives has taken them to Pre-Op
+        return  # on EtherCAT motors run only in Op, and opening the drives has taken them to Pre-Op
     axes = [(drives.nodes[node], part) for node, part in (divmod(k, drives.description.num_axes) for k in chosen)]
     clients = {node: drives.sdo(k) for k, node in enumerate(drives.nodes)}
     for outcome in stop_axes(drives.port, clients, axes, drives.description.answer_timeout):
@@ -190,7 +190,7 @@ def _bring_to_rest(drives: BusDrives, chosen: list[int]) -> None:
 
 
 def _without_remote_frames(entry: Entry, wanted: list[Any], found: list[Any]) -> list[Any]:
-    """Return the values that were wanted with bit 30 where a drive keeps it, and say so on stderr.
+    """Return the wanted values with bit 30 set if the drive keeps it, with a note on stderr.
 
     CiA 301 has it in the COB-ID of a PDO: no remote frames for it. A drive that answers none may keep it set.
     """
@@ -208,7 +208,7 @@ def _without_remote_frames(entry: Entry, wanted: list[Any], found: list[Any]) ->
 
 
 def _live(drives: BusDrives) -> str:
-    """Return which axes are enabled by their statuswords, read now; "" for none."""
+    """Return the axes that are enabled by their present statuswords, as text; "" if there are none."""
     status = [int(word) for word in drives.read(cia402.STATUSWORD)]
     return ", ".join(
         f"{axis_name(drives, axis)} ({word:04X}h)" for axis, word in enumerate(status) if cia402.is_live(word)
@@ -216,7 +216,7 @@ def _live(drives: BusDrives) -> str:
 
 
 def _keep_watchdog(drives: BusDrives, entry: Entry) -> None:
-    """Raise RuntimeError where an axis is enabled that stops by this object when its master dies."""
+    """Raise RuntimeError if an axis is enabled that needs this object to stop when its master dies."""
     if who := _live(drives):
         raise RuntimeError(
             f"{who} is enabled by its statusword, and {entry.label} is part of what stops it when its master dies, "
@@ -226,10 +226,10 @@ def _keep_watchdog(drives: BusDrives, entry: Entry) -> None:
 
 
 def _write(drives: BusDrives, entry: Entry, axes: list[int], value: Any) -> None:
-    """Write an object of some axes (a text has none); one of a watchdog is put back where one was enabled meanwhile.
+    """Write an object of some axes (a text has none); a watchdog's is restored if an axis was enabled meanwhile.
 
-    Between our look at the statusword and our write another master may enable, and nothing on the bus keeps it from
-    that. So we look again, and an axis that does not answer counts as enabled.
+    Between our check of the statusword and our write another master may enable an axis. So the statusword is checked
+    again, and an axis that does not answer counts as enabled.
 
     Raises:
         RuntimeError: If an axis was enabled meanwhile.
@@ -245,7 +245,7 @@ def _write(drives: BusDrives, entry: Entry, axes: list[int], value: Any) -> None
     if not is_of_a_watchdog(entry.index):
         drives.write(key, value, where=where)
         return
-    before = [int(one) for one in drives.read(key)]  # last before the write: it may be another program's by now
+    before = [int(one) for one in drives.read(key)]  # read last: another program may have changed it
     drives.write(key, value, where=where)
     try:
         who = _live(drives)
@@ -262,7 +262,7 @@ def _write(drives: BusDrives, entry: Entry, axes: list[int], value: Any) -> None
 
 
 def _ask_where_live(drives: BusDrives, what: str, yes: bool) -> None:
-    """Have the user agree to a write where a drive may turn its motor; `ask` raises otherwise."""
+    """Ask the user to confirm a write if a drive may turn its motor; `ask` raises otherwise."""
     if who := _live(drives):
         ask(f"{who} is enabled by its statusword, and reacts at once (to stop it, set 6040 to 2). Write {what}?", yes)
 

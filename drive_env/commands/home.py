@@ -36,8 +36,8 @@ from drive_env.commands.options import (
 )
 from drive_env.commands.tables import print_lines
 
-SETTLING = 40  # looks, a STANDSTILL apart, in which an axis must come to rest at home
-REACHED = cia402.TARGET_REACHED.mask  # at rest, which the command sees by the position
+SETTLING = 40  # checks, a STANDSTILL apart, within which an axis must come to rest at home
+REACHED = cia402.TARGET_REACHED.mask  # at rest, which the command determines by the position
 # Bit 12, without bit 13, which reports an error.
 ATTAINED = cia402.Pattern(cia402.HOMING_BITS ^ REACHED, cia402.HOMED ^ REACHED)
 
@@ -47,7 +47,7 @@ class _Homing(NamedTuple):
 
     Attributes:
         one: The axis.
-        method: The number to home by.
+        method: Number of the homing method.
         is_own: Whether the drive has that number in 6098h already.
     """
 
@@ -57,12 +57,12 @@ class _Homing(NamedTuple):
 
     @property
     def words(self) -> str:
-        """What the axis will do."""
+        """Description of the axis' plan."""
         is_known = self.one.drives.description.device is not None
         return f"homed by method {self.method} ({_text(self.method, is_known)})"
 
     def run(self, within: float) -> MoveOutcome:
-        """Home the axis, switch it off, and give the drive its own method back."""
+        """Home the axis, switch it off, and restore the drive's own method."""
         from drive_env.drives.lent_object import lent
 
         one = self.one
@@ -151,7 +151,7 @@ def _planned(one: OneAxis, method: int | None, json: bool) -> _Homing:
 
 
 def _check_speeds(one: OneAxis, method: int) -> None:
-    """Raise ValueError where a speed or the acceleration that a method needs is 0: the axis would not move."""
+    """Raise ValueError if a speed or the acceleration that a method needs is 0: the axis would not move."""
     from drive_env.drives.homing import missing_speeds
 
     for (index, sub), example in missing_speeds(one.drives, one.drives.description, one.axis, method).items():
@@ -162,7 +162,7 @@ def _check_speeds(one: OneAxis, method: int) -> None:
 
 
 def _print_methods(one: OneAxis, there: list[int], json: bool) -> None:
-    """Print the methods that an axis has, each with what it does; those of CiA 402 where it does not say."""
+    """Print the methods that an axis has, with descriptions; those of CiA 402 if it does not list any."""
     from drive_env.dictionary.homing_methods import METHODS
 
     is_known = one.drives.description.device is not None
@@ -177,7 +177,7 @@ def _print_methods(one: OneAxis, there: list[int], json: bool) -> None:
 
 
 def _find_home(one: OneAxis, within: float) -> None:
-    """Home an axis and wait until it stands there; RuntimeError for one that moves on, whatever its drive reports."""
+    """Home an axis and wait until it stands; RuntimeError if it moves on, regardless of its drive's report."""
     from drive_env import motion
 
     motion.home(one.drives, where=one.where, timeout=within)
@@ -190,7 +190,7 @@ def _find_home(one: OneAxis, within: float) -> None:
 
 
 def _report(homing: _Homing, outcome: MoveOutcome, json: bool) -> None:
-    """Print the result of a homing; exit code 1 where the drive does not show that it attained home."""
+    """Print the result of a homing; exit code 1 unless the drive shows that it attained home."""
     one = homing.one
     is_home = bool(cia402.matches(outcome.status, ATTAINED))
     stopped = outcome.stopped(is_home)

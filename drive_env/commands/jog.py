@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from drive_env.dictionary.entries import Entry
     from drive_env.dictionary.quantities import Scale
 
-ENOUGH = 0.9  # of the way asked for: an axis that has moved less, with an emergency, was stopped by that
+ENOUGH = 0.9  # of the requested distance: an axis that moved less, with an emergency, was stopped by it
 
 
 @grouped
@@ -112,18 +112,18 @@ class _Movement:
 
     @property
     def way(self) -> float:
-        """How far the axis turns if nothing stops it."""
+        """Distance of the movement if nothing stops it."""
         return self.velocity * self.duration if self.distance is None else self.distance
 
     def run(self, one: OneAxis, is_recorded: bool) -> Any:
-        """Enable the axis and move it; return the samples that were wanted of it."""
+        """Enable the axis and move it; return the requested samples."""
         if self.distance is None:
             return _turn(one, self.velocity, round(self.duration, 3), is_recorded)
         return go(one, self.distance, abs(self.velocity), relative=True, is_recorded=is_recorded)
 
 
 def _asked_for(one: OneAxis, speed: str, by: str | None, duration: float) -> _Movement:
-    """Return the movement that the arguments ask for, before the axis is enabled; ValueError for one that cannot be."""
+    """Return the movement of the arguments, before the axis is enabled; ValueError for an impossible one."""
     velocity = one.parse(speed, one.target)
     if velocity == 0:
         raise ValueError("a speed of 0 does not move the axis; give one, e.g. '60 rpm'")
@@ -138,9 +138,9 @@ def _verdict(share: float, outcome: MoveOutcome, meant: str) -> str:
     """Return why a movement failed; "" if it did not.
 
     Args:
-        share: What came of the way, or of the speed, that was asked for.
-        outcome: What the drive shows.
-        meant: The speed that was asked for, in words.
+        share: Achieved share of the requested distance or speed.
+        outcome: The drive's values at the end.
+        meant: The requested speed as text.
     """
     if stopped := outcome.stopped(share >= ENOUGH):
         return stopped
@@ -153,7 +153,7 @@ def _verdict(share: float, outcome: MoveOutcome, meant: str) -> str:
 
 
 def _speed_in_words(speed: str, velocity: int, entry: Entry, scale: Scale) -> str:
-    """Return a speed in words, and how to write rpm if it was a bare number."""
+    """Return a speed as text, with a hint about rpm if it was a bare number."""
     from drive_env.dictionary import quantities
 
     text = quantities.show(velocity, entry, scale)
@@ -165,11 +165,11 @@ def _speed_in_words(speed: str, velocity: int, entry: Entry, scale: Scale) -> st
 
 
 def _turn(one: OneAxis, velocity: int, duration: float, is_recorded: bool) -> Any:
-    """Turn at a speed, let the drive brake with its own deceleration; return the samples that were wanted of it."""
+    """Turn at a speed, let the drive brake with its own deceleration; return the requested samples."""
     from drive_env import motion
 
     drives, cycle = one.drives, one.cycle
-    if is_recorded:  # mapping takes a while: not with an axis enabled
+    if is_recorded:  # mapping takes a while: not while an axis is enabled
         one.record(0.0, {one.target: one.rows([], 0)})
     motion.enable(drives, mode=one.mode, where=one.where)
     trace = None
@@ -186,7 +186,7 @@ def _turn(one: OneAxis, velocity: int, duration: float, is_recorded: bool) -> An
         if not one.has_position:
             one.turned = one.read(one.speed)
     motion.turn(drives, 0, one.where)
-    # Bit 10 in pv and vl tells that the ramp has ended.
+    # Bit 10 in pv and vl shows that the ramp has ended.
     motion.wait_for(drives, cia402.TARGET_REACHED, 10.0, "standstill", one.where)
     drives.advance(one.cycles(STANDSTILL) * cycle)
     return trace

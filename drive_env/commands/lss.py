@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 NOTHING_FOUND = 1
 STORE_TIMEOUT = 5.0  # s: erasing flash takes up to seconds
 BOOT_TIMEOUT = 5.0  # s: drives boot within one or two
-LONGEST_DELAY = 60.0  # s of the 65.535 that a frame holds
+LONGEST_DELAY = 60.0  # s, of the 65.535 that fit into a frame
 RESET_COMMUNICATION = 0x82
 
 lss_app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown")
@@ -195,7 +195,7 @@ def set_bit_rate(
                 kept = "" if store else "; it is lost with the power"
                 if activate is None:
                     print(f"{_name(chosen, node)} has {new} bit/s with the next power-on")
-                else:  # no frame of this bus can show it
+                else:  # this bus cannot show it
                     print(f"{_name(chosen, node)} changes to {new} bit/s in {activate:g} s{kept}; open the bus with it "
                           "to see that it is there")  # fmt: skip
 
@@ -231,7 +231,7 @@ def _check_choice(identity: str | None, node: int | None, dry_run: bool) -> None
 
 
 def _choose(port: Port, master: LssMaster, identity: str | None, node: int | None, timeout: float) -> LssIdentity:
-    """Return the identity of the node that is meant; all slaves wait afterwards."""
+    """Return the identity of the chosen node; all slaves wait afterwards."""
     from drive_env.master.can.lss import LssError, identity_of, parse_identity, show
 
     if identity is not None:

@@ -1,4 +1,4 @@
-"""`drive-env model`: drives for the joints of a model, or how far a model is from a log, and machines that fit it."""
+"""`drive-env model`: drives for a model's joints; or a model's deviation from a log, and machines that fit."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from drive_env.dictionary.entries import ObjectDictionary
     from drive_env.trials.replay import LogDifference, LogFit
 
-LEAST = 16  # machines that a fit needs
+LEAST = 16  # least number of machines of a fit
 MOVE_TIME = 2.0  # s
 
 
@@ -98,7 +98,7 @@ def model(
         from drive_env.trials.replay import read_log
 
         recorded = read_log(log)
-        # The compiler is imported from here on: a mistake above is told at once.
+        # The compiler is imported only from here on: mistakes above are reported at once.
         from drive_env.emulator.emulated_drives import EmulatedDrives
         from drive_env.master.parameter_files import load_parameters
         from drive_env.randomisation.random_machines import Distributions
@@ -159,7 +159,7 @@ def _propose(
 
 
 def _check(fit: list[str] | None, machines: int, rounds: int, out: Path | None) -> None:
-    """Raise ValueError for options that cannot be, before anything is computed."""
+    """Raise ValueError for impossible options, before anything is computed."""
     if out is not None and not fit:
         raise ValueError("--out is for the fitted distributions; name the parameters to fit with --fit")
     if fit and machines < LEAST:

@@ -1,4 +1,4 @@
-"""What `drive-env model` proposes for a file: motor and gears of its joints, printed, and written as a model to run."""
+"""The proposal of `drive-env model`: motor and gears for a file's joints, printed, and written as a model to run."""
 
 from __future__ import annotations
 
@@ -72,10 +72,10 @@ def propose(
 
 
 def write_model(load: Load, gears: dict[str, float], out: Path) -> Path:
-    """Write a model whose joints drives turn, with the files that it takes in, into a new folder; return the model.
+    """Write a model with driven joints and the files that it includes into a new folder; return the model.
 
     Raises:
-        ValueError: If it is no load: with a free joint, say.
+        ValueError: If it is not a load, e.g. has a free joint.
         OSError: If it cannot be written; the folder is then not there.
     """
     from drive_env.whole_file import write_whole
@@ -88,12 +88,12 @@ def write_model(load: Load, gears: dict[str, float], out: Path) -> Path:
     path = out / f"{load.mjcf.stem}.xml"
     try:
         for file in files_of_model(load.mjcf):
-            if file.suffix not in (".xml", ".mjcf", ".urdf"):  # what is MJCF again is in the text
+            if file.suffix not in (".xml", ".mjcf", ".urdf"):  # included MJCF is in the text already
                 write_whole(out / os.path.relpath(os.path.normpath(file), root), read_bytes(file, MOST_RECORDING))
         write_whole(path, text)
         find_load(path)
     except BaseException:
-        shutil.rmtree(out, ignore_errors=True)  # it would be refused the next time
+        shutil.rmtree(out, ignore_errors=True)  # an existing folder would be refused the next time
         raise
     return path
 
@@ -101,7 +101,7 @@ def write_model(load: Load, gears: dict[str, float], out: Path) -> Path:
 def print_proposal(
     load: Load, device: Device, found: Sequence[JointLoad], proposal: DriveProposal, move_time: float, out: Path | None
 ) -> None:
-    """Print the proposal as a table, with what no drive turns and why, and how to run what was written."""
+    """Print the proposal as a table, with joints that cannot be driven and why, and how to run the written model."""
     from drive_env.emulator.sizing import MARGIN, demand
 
     motor = proposal.motor
@@ -141,7 +141,7 @@ def print_proposal(
 
 
 def print_proposal_json(found: Sequence[JointLoad], proposal: DriveProposal, out: Path | None) -> None:
-    """Print the same as JSON, SI."""
+    """Print the proposal as JSON, in SI units."""
     axes = iter(proposal.axes)
     told: list[dict[str, Any]] = []
     for row in found:

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from drive_env.master.bus_drives import BusDrives
 
 SPARKS = "▁▂▃▄▅▆▇█"
-MOST_SPARKS = 32  # readings that a line of --plot shows
+MOST_SPARKS = 32  # readings in a line of --plot
 DEFAULT = ("6041", "6061", "6064", "606C", "6077")
 
 
@@ -83,11 +83,11 @@ def _look(drives: BusDrives, axes: list[int], entries: list[Any]) -> dict[Any, A
 
 
 class _Pushing:
-    """Axes whose current is at its limit while they stand, by readings of their own.
+    """Finds axes that stand with their current at its limit, by its own readings.
 
     Args:
         drives: The drives.
-        axes: Which are looked at.
+        axes: The axes to check.
     """
 
     def __init__(self, drives: BusDrives, axes: list[int]) -> None:
@@ -113,7 +113,7 @@ class _Pushing:
 
 
 def _heard(drives: BusDrives, axes: list[int]) -> list[Any]:
-    """Return the emergencies of these axes, of all of a node those that tell none."""
+    """Return the emergencies of these axes, including those of their nodes without an axis."""
     return [message for message in drives.emergencies() if message.axis in axes]
 
 
@@ -164,12 +164,12 @@ def _table(
 
 
 def _is_number(entry: Entry) -> bool:
-    """Return whether an object has values to draw: a number that is no statusword."""
+    """Return whether an object can be drawn: a number except a statusword."""
     return entry.bits is not None and cia402.of_first_axis(entry.index) != cia402.STATUSWORD
 
 
 def spark_line(values: Sequence[int]) -> str:
-    """Return numbers as a line of bars, from the least, the lowest bar, to the greatest; flat where all are equal."""
+    """Return numbers as a line of bars, scaled from the least to the greatest; flat if all are equal."""
     low, span = min(values), max(values) - min(values)
     return "".join(SPARKS[(value - low) * (len(SPARKS) - 1) // span if span else 0] for value in values)
 

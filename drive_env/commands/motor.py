@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from drive_env.motors import Motor
 
-Printed = tuple[float, str]  # a number's value in the file, and as it was typed
+Printed = tuple[float, str]  # a number's value in the file, and the typed text
 
 motor_app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown")
 
@@ -27,7 +27,7 @@ def motor() -> None:
     """Motors that the catalogue does not have; --motor takes the path of such a file wherever it takes a name."""
 
 
-# What to do where a data sheet lacks a number that is needed.
+# Remedies for required numbers that a data sheet lacks.
 ESTIMATES = {
     "inertia_kg_m2": "where the data sheet lacks it, take that of a motor of the same size: tuning measures the "
     "inertia of motor and load together"
@@ -99,7 +99,6 @@ def new_motor(
 
 
 def _list_numbers() -> None:
-    """Print the numbers, those of each kind of motor together."""
     from drive_env import motors
 
     brushed = motors.OF_DC
@@ -128,7 +127,6 @@ def _list_numbers() -> None:
 
 
 def _given(texts: list[str]) -> dict[str, Printed]:
-    """Return the numbers of the command line."""
     found: dict[str, Printed] = {}
     for text in texts:
         name, _, value = (part.strip() for part in text.partition("="))
@@ -137,7 +135,6 @@ def _given(texts: list[str]) -> dict[str, Printed]:
 
 
 def _read(name: str, text: str) -> dict[str, Printed]:
-    """Return a number by its name in the file."""
     from drive_env.motors.data_sheet import read_number
 
     key, value = read_number(name, text)
@@ -145,7 +142,7 @@ def _read(name: str, text: str) -> dict[str, Printed]:
 
 
 def _missing(kind: str, given: Mapping[str, Printed]) -> list[tuple[str, ...]]:
-    """Return the quantities that are still missing, each as the names by which it can be given."""
+    """Return the quantities that are still missing, each with the names of its forms."""
     from drive_env import motors
 
     if kind == "stepper":
@@ -165,7 +162,7 @@ def _missing(kind: str, given: Mapping[str, Printed]) -> list[tuple[str, ...]]:
 
 
 def _ask_for(choice: tuple[str, ...]) -> tuple[str, str]:
-    """Return the form of a quantity that the user chooses, and what he types."""
+    """Return the form of a quantity that the user chooses, and the typed value."""
     from drive_env.motors import NUMBERS
 
     name = choice[0]
@@ -186,7 +183,7 @@ def _is_answered() -> bool:
 
 
 def _asked(what: str, default: str) -> str:
-    """Ask at a terminal; without one say which option answers."""
+    """Ask at a terminal; without one name the option instead."""
     if not _is_answered():
         raise ValueError(f"{what} is missing; give it as an option (--kind, --source)")
     return str(typer.prompt(what, default=default or None, err=True))
@@ -209,7 +206,7 @@ def _write(file: Path, data: Mapping[str, object], printed: Mapping[str, str]) -
 
 
 def _tell(file: Path, row: Motor) -> None:
-    """Print figures that follow from the numbers, so that a wrong one is noticed."""
+    """Print figures derived from the numbers, which reveal wrong ones."""
     from drive_env.devices import device_names, find_device
     from drive_env.firmware import motor_kinds
     from drive_env.motors import is_extra_low
@@ -226,7 +223,7 @@ def _tell(file: Path, row: Motor) -> None:
         print(f"  torque constant {row.torque_constant:.4g} N*m/A of peak i_q; {no_load * rpm:.0f} rpm without load")
         print(f"  rated power {row.rated_torque * row.rated_speed:.3g} W")
     of_kind = [device for device in map(find_device, device_names()) if row.kind in motor_kinds(device.firmware_name)]
-    # A device of another voltage class is not expected to turn it.
+    # A device of another voltage class need not support it.
     of_kind = [one for one in of_kind if is_extra_low(one.highest_supply) == is_extra_low(row.voltage)] or of_kind
     refused = {}
     for device in of_kind:

@@ -78,7 +78,7 @@ def new_from_eds(
             if is_ethercat:
                 sii_content(device)
         except BaseException:
-            shutil.rmtree(folder, ignore_errors=True)  # it would be refused the next time
+            shutil.rmtree(folder, ignore_errors=True)  # an existing folder would be refused the next time
             raise
         if json:
             print_json({

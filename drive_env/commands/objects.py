@@ -63,7 +63,7 @@ def objects(
 
 
 def _type(entry: Entry) -> str:
-    """Return an object's data type by the names of CiA 301; "text" for what is no integer."""
+    """Return an object's data type by the names of CiA 301; "text" if it is not an integer."""
     if entry.bits is None:
         return "text"
     return "BOOLEAN" if entry.bits == 1 else f"{'INTEGER' if entry.signed else 'UNSIGNED'}{entry.bits}"

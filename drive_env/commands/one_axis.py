@@ -38,29 +38,29 @@ Recording = Annotated[
 ]
 WATCHDOGS = (0x1016, 0x100C)  # heartbeat consumer, life guarding
 POSITION = (cia402.POSITION_ACTUAL, 0)
-# Of each mode: the object that keeps an axis from moving if it is 0, its words, and a value for it.
+# For each mode: the object that prevents motion if it is 0, its name, and an example value.
 PROFILE = ((cia402.PROFILE_ACCELERATION, 0), "profile acceleration 6083h", "6083 '500 rev/s^2'")
 ACCELERATION = {
     "pp": PROFILE,
     "pv": PROFILE,
     "vl": ((cia402.VL_ACCELERATION, 1), "acceleration 6048h:01", "6048:1 1000"),
 }
-BEFORE, AFTER = 0.02, 0.5  # s recorded at rest before a movement, and besides the time that it should take
-LOOK, STANDS = 0.2, 0.05  # s between two looks, and the share of the speed asked for below which an axis stands
-STANDSTILL = 0.05  # s, that the drives get to come to rest
-LEAST = 0.01  # of the way asked for: an axis that has moved less has not moved, one that is so near has arrived
+BEFORE, AFTER = 0.02, 0.5  # s recorded at rest before a movement, and after its expected time
+LOOK, STANDS = 0.2, 0.05  # s between two checks, and the share of the requested speed below which an axis stands
+STANDSTILL = 0.05  # s for the drives to come to rest
+LEAST = 0.01  # of the requested distance: an axis that moved less has not moved, one that is nearer has arrived
 
 
 class MoveOutcome(NamedTuple):
-    """The end of a movement: what the drive itself shows, and what stopped it.
+    """The end of a movement: the drive's values, and the reasons of an early stop.
 
     Attributes:
         status: Statusword at the end of the movement, before the axis was switched off.
-        reached: Position then [inc]; 0 of a drive without one.
-        end: Position after the axis was switched off [inc]; 0 of a drive without one.
+        reached: Position then [inc]; 0 if the drive has no position.
+        end: Position after the axis was switched off [inc]; 0 if the drive has no position.
         reasons: Why the movement was stopped; [] if it was not.
         emergencies: Those of the axis, as their fields.
-        trace: The samples that were wanted of it; None if none were, or none came.
+        trace: The requested samples; None if there are none.
     """
 
     status: int
@@ -76,7 +76,7 @@ class MoveOutcome(NamedTuple):
         return [told(message) for message in self.emergencies if is_error(message)]
 
     def stopped(self, is_there: bool) -> str:
-        """Return the reason of an early stop; "" without one. `is_there`: an emergency on the way stopped nothing."""
+        """Return the reason of an early stop; "" without one. `is_there`: the axis arrived in spite of an emergency."""
         if self.errors and (self.reasons or not is_there):
             why = [", ".join(dict.fromkeys(self.errors)), *self.reasons]
             return f"the movement was stopped: emergency {'; '.join(why)}"
@@ -84,16 +84,16 @@ class MoveOutcome(NamedTuple):
 
 
 class OneAxis:
-    """The axis that turns, and the others of its node, which are let alone.
+    """The axis to move; the others of its node are left alone.
 
     Args:
         drives: Drives of one node, with the envelope.
         axis: Its number.
 
     Attributes:
-        mode: In which it turns at a speed.
+        mode: Its mode for turning at a speed.
         target: The object of that speed.
-        has_position: Whether its drive shows where it is.
+        has_position: Whether its drive shows a position.
         speed: The object that shows the speed.
         turned: The speed before it was brought to rest, of a drive without a position; 0 of others.
     """
@@ -225,13 +225,13 @@ def _recorded(known: ObjectDictionary) -> list[cia402.Key]:
 
 
 def check_axis(description: Description, axis: int) -> None:
-    """Raise ValueError for an axis that a node does not have."""
+    """Raise ValueError for an axis that a node lacks."""
     if not 0 <= axis < description.num_axes:
         raise ValueError(f"--axis {axis}: a {description.name} has {description.num_axes} axes, from 0")
 
 
 def limits_of(description: Description, max_current: str | None, interface: str | None, *, no_watchdog: bool) -> Limits:
-    """Return the envelope's limits for --max-current and --no-watchdog; ValueError for what the drive cannot have."""
+    """Return the envelope's limits for --max-current and --no-watchdog; ValueError for an impossible value."""
     from drive_env.dictionary import quantities
     from drive_env.dictionary.roles import Role
     from drive_env.drives.limits import Limits
@@ -276,7 +276,7 @@ def what_stops(reasons: list[str]) -> Iterator[None]:
     except SafetyError as error:
         text = str(error).replace("Limits(current=...)", "--max-current").partition(", or set Limits(")[0]
         reasons.append(text.replace(", or raise Limits(velocity=...): ", ": "))
-    except (RuntimeError, TimeoutError) as error:  # motion's, whose remedies are Python's
+    except (RuntimeError, TimeoutError) as error:  # motion.py's errors, whose remedies are for Python
         reasons.append(str(error).partition(";")[0])
 
 
@@ -300,14 +300,14 @@ def told(message: dict[str, Any]) -> str:
 
 
 def go(one: OneAxis, goal: int, velocity: int, *, relative: bool, is_recorded: bool) -> Any:
-    """Move in pp, and give the drive its profile velocity back; return the samples that were wanted of it.
+    """Move in pp, restore the drive's profile velocity, and return the requested samples.
 
     Args:
         one: The axis.
-        goal: Position, or way [inc].
+        goal: Position, or distance [inc].
         velocity: Profile velocity, above 0, in the drive's unit.
-        relative: Whether the goal is a way.
-        is_recorded: Whether samples are wanted.
+        relative: Whether the goal is a distance.
+        is_recorded: Whether to record samples.
     """
     from drive_env import motion
     from drive_env.drives.lent_object import lent
@@ -316,7 +316,7 @@ def go(one: OneAxis, goal: int, velocity: int, *, relative: bool, is_recorded: b
     duration = abs(goal if relative else goal - one.read(cia402.POSITION_ACTUAL)) / velocity
     trace = None
     with lent(drives, cia402.PROFILE_VELOCITY, velocity, one.where):
-        if is_recorded:  # mapping takes a while: not with an axis enabled
+        if is_recorded:  # mapping takes a while: not while an axis is enabled
             nothing = one.rows([], 0)
             one.record(0.0, {cia402.TARGET_POSITION: nothing, cia402.CONTROLWORD: nothing})
         motion.enable(drives, mode="pp", where=one.where)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from drive_env.master.bus_drives import BusDrives
 
 REFUSED, USER_ERROR, INTERRUPTED = 1, 2, 130
-AXIS_CYCLE = 0.001  # s of a bus of 1 Mbit/s for each axis of a node: seven frames
+AXIS_CYCLE = 0.001  # s on a bus of 1 Mbit/s for each axis of a node: seven frames
 
 Interface = Annotated[
     str | None,
@@ -57,7 +57,7 @@ Nodes = Annotated[
     ),
 ]  # fmt: skip
 OneNode = Annotated[
-    list[int] | None,  # so that a second one is refused, and does not take the place of the first
+    list[int] | None,  # a list, so that a second one is refused instead of replacing the first
     typer.Option(
         "--node", "-n", metavar="<int>", help="Node-ID, on EtherCAT the position.", show_default=FIRST_NODE,
     ),
@@ -94,12 +94,12 @@ Yes = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask for confirmat
 _INDEX = re.compile(r"^(?:0x)?([0-9a-f]{4})h?(?:[:.]([0-9a-f]{1,2})h?)?$", re.IGNORECASE)
 
 
-# Each of these options means drives on a bus.
+# Each of these options selects drives on a bus.
 OF_A_BUS = ("interface", "channel", "node", "nodes", "bitrate", "lockstep")
 
 
 def was_typed(context: typer.Context, name: str) -> bool:
-    """Return whether an option is on the command line: one in the environment must not make a motor turn."""
+    """Return whether an option is on the command line: one from the environment must not start a motor."""
     source = context.get_parameter_source(name)
     return source is not None and source.name == "COMMANDLINE"
 
@@ -110,13 +110,13 @@ def names_a_bus(context: typer.Context) -> bool:
 
 
 def file_names_a_bus(context: typer.Context) -> bool:
-    """Return whether a file of options names a bus or a node of it, and the command line does not replace that."""
+    """Return whether a file of options names a bus or a node of it, and the command line does not override it."""
     sources = (context.get_parameter_source(name) for name in OF_A_BUS)
     return any(source is not None and source.name == "DEFAULT_MAP" for source in sources)
 
 
 def object_name(text: str) -> ObjectName:
-    """Return how the dictionary is asked for an object written as 6041, 607D:1 (hexadecimal) or name."""
+    """Return the dictionary's form of an object name: 6041, 607D:1 (hexadecimal) or a name."""
     found = _INDEX.match(text.strip())
     if found is None:
         return text
@@ -125,7 +125,7 @@ def object_name(text: str) -> ObjectName:
 
 @dataclass(frozen=True, kw_only=True)
 class BusOptions:
-    """Options that name drives on a bus; `grouped` gives a command those of a kind in place of its argument of it."""
+    """Options that name drives on a bus; `grouped` replaces a command's argument of this class by its options."""
 
     PANEL: ClassVar[str] = "Which drive"
     interface: Interface = None
@@ -136,11 +136,11 @@ class BusOptions:
 
     @property
     def nodes(self) -> list[int] | None:
-        """The nodes that are named; None for the first."""
+        """The named nodes; None for the first."""
         return None
 
     def connect(self, eds: Path | None = None, **others: Any) -> BusDrives:
-        """Open the drives, of a device or an EDS; `others` as `open_drives` has them."""
+        """Open the drives, of a device or an EDS; `others` as for `open_drives`."""
         from drive_env.master.open_drives import open_drives
 
         if self.bitrate is not None:
@@ -157,32 +157,32 @@ class BusOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class NodesOptions(BusOptions):
-    """The same of several nodes."""
+    """Options that name several nodes on a bus."""
 
     node: Nodes = None
 
     @property
     def nodes(self) -> list[int] | None:
-        """The nodes that are named; None for the first."""
+        """The named nodes; None for the first."""
         return self.node or None
 
 
 @dataclass(frozen=True, kw_only=True)
 class AxesOptions(NodesOptions):
-    """The same of the axes of several nodes."""
+    """Options that name axes of several nodes on a bus."""
 
     axis: AxisOfNode = None
 
 
 @dataclass(frozen=True, kw_only=True)
 class NodeOptions(BusOptions):
-    """The same of one node."""
+    """Options that name one node on a bus."""
 
     node: OneNode = None
 
     @property
     def nodes(self) -> list[int] | None:
-        """The node, if it is named; None for the first. ValueError for several."""
+        """The named node; None for the first. ValueError for several."""
         if len(self.node or ()) > 1:
             raise ValueError(
                 f"--node {' --node '.join(map(str, self.node or ()))}: this command is of one node; run it once for "
@@ -192,7 +192,7 @@ class NodeOptions(BusOptions):
 
     @property
     def number(self) -> int:
-        """The node that was asked for, or the first."""
+        """The named node, or the first."""
         from drive_env.master.open_drives import default_nodes
 
         return (self.nodes or default_nodes(self.interface))[0]
@@ -200,13 +200,13 @@ class NodeOptions(BusOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class AxisOptions(NodeOptions):
-    """The same of one axis of one node."""
+    """Options that name one axis of one node on a bus."""
 
     axis: OneAxis = None
 
     @property
     def one_axis(self) -> int:
-        """The axis, if it is named; else the first. ValueError for several."""
+        """The named axis, or the first. ValueError for several."""
         if len(self.axis or ()) > 1:
             raise ValueError(
                 f"--axis {' --axis '.join(map(str, self.axis or ()))}: this command is of one axis; run it once for "
@@ -217,18 +217,18 @@ class AxisOptions(NodeOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class AxesInOrderOptions(NodeOptions):
-    """The same of axes of one node, one after the other."""
+    """Options that name axes of one node, in an order."""
 
     axis: AxesInOrder = None
 
     @property
     def axes(self) -> list[int]:
-        """The axes that are named, in their order, or the first."""
+        """The named axes, in their order, or the first."""
         return self.axis or [0]
 
 
 def grouped(command: Callable[..., None]) -> Callable[..., None]:
-    """Let a command have the fields of a dataclass as options, for each argument that is one."""
+    """Replace each argument of a command that is a dataclass by options for its fields."""
     own = inspect.signature(command, eval_str=True).parameters
     kinds = {name: p.annotation for name, p in own.items()}
     groups = {name: kind for name, kind in kinds.items() if isinstance(kind, type) and is_dataclass(kind)}
@@ -249,7 +249,7 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def options_of(group: type[Any]) -> list[inspect.Parameter]:
-    """Return the options that the fields of a dataclass are; `--help` shows them under its `PANEL`."""
+    """Return the options for the fields of a dataclass; `--help` shows them under its `PANEL`."""
     hints = get_type_hints(group, include_extras=True)
     for field in fields(group):
         for option in getattr(hints[field.name], "__metadata__", ()):
@@ -261,7 +261,7 @@ def options_of(group: type[Any]) -> list[inspect.Parameter]:
 
 
 def with_options(run: Callable[..., None], taken: list[inspect.Parameter]) -> Callable[..., None]:
-    """Return a function that typer gives these options."""
+    """Return a function with these options for typer."""
     run.__signature__ = inspect.Signature(taken)  # type: ignore[attr-defined]  # what typer reads
     run.__annotations__ = {p.name: p.annotation for p in taken}
     return run
@@ -276,7 +276,7 @@ def look_first(
     eds: Path | None = None,
     timeout: float | None = None,
 ) -> None:
-    """Raise NoAnswerError for a node on CAN that is silent: to open it as drives would send it an NMT command."""
+    """Raise NoAnswerError for a silent node on CAN, without the NMT command that opening drives would send."""
     from drive_env.fieldbus.errors import NoAnswerError
     from drive_env.master.open_drives import check_answers
 
@@ -291,7 +291,7 @@ def look_first(
 
 @contextmanager
 def errors_as_exit_codes() -> Iterator[None]:
-    """End with one red line: code 1 for what a drive or the bus says, 2 for the user's mistake, 130 for Ctrl-C."""
+    """End with one red line: code 1 for an error of a drive or the bus, 2 for the user's mistake, 130 for Ctrl-C."""
     from drive_env.fieldbus.errors import BusError, RefusedError
     from drive_env.safety.envelope import SafetyError
 
@@ -306,12 +306,12 @@ def ending_by(
     refused: tuple[type[Exception], ...],
     mistakes: tuple[type[Exception], ...] = (),
 ) -> Iterator[None]:
-    """End a program by its own `fail`, which takes the message and the exit code.
+    """End a program by its own `fail`, called with the message and the exit code.
 
     Args:
-        fail: What ends it.
-        refused: Errors that end it with 1 besides a plain RuntimeError; a bus that cannot be opened is a mistake.
-        mistakes: Errors that end it with 2 besides a ValueError, an object that cannot be had and a file's.
+        fail: Ends the program.
+        refused: Errors with exit code 1, in addition to a plain RuntimeError; a bus that cannot be opened is a mistake.
+        mistakes: Errors with exit code 2, in addition to ValueError, errors of objects and of files.
     """
     from drive_env.dictionary.aborts import ObjectAccessError
     from drive_env.fieldbus.errors import OpenError
@@ -325,13 +325,13 @@ def ending_by(
         fail(error, REFUSED)
     except mistaken as error:
         fail(error, USER_ERROR)
-    except RuntimeError as error:  # motion: an axis is in fault; ask: the user says no
+    except RuntimeError as error:  # motion.py: an axis is in fault; `ask`: the user says no
         if type(error) is not RuntimeError:
             raise
         fail(error, REFUSED)
     except OSError as error:
         if isinstance(error, BrokenPipeError) and output_is_closed():
-            raise typer.Exit(CLOSED) from None  # `| head -1` has read enough: no error, and no reader for a message
+            raise typer.Exit(CLOSED) from None  # `| head -1` has read enough: neither an error nor a message
         fail(f"{error.filename}: {error.strerror}" if error.filename else error, USER_ERROR)
     except MemoryError as error:
         fail(f"there is not enough memory{f' ({error})' if str(error) else ''}; ask for less at a time", USER_ERROR)
@@ -341,7 +341,7 @@ def ending_by(
 
 @contextmanager
 def told_if_interrupted(what: str) -> Iterator[None]:
-    """Print which files were written, if Ctrl-C ends a block before the command has printed it."""
+    """Print the written files if Ctrl-C ends a block before the command has printed them."""
     try:
         yield
     except KeyboardInterrupt:
@@ -362,7 +362,7 @@ def print_json(value: Any) -> None:
 
 
 def check_time(option: str, value: float | None) -> None:
-    """Raise ValueError for a time [s] that is not above 0, endless, or not a number; None is any."""
+    """Raise ValueError for a time [s] that is not above 0, infinite, or not a number; None is accepted."""
     from drive_env.drives.arguments import LONGEST
 
     if value is not None and not 0.0 < value <= LONGEST:
@@ -372,7 +372,7 @@ def check_time(option: str, value: float | None) -> None:
 def check_free(file: Path, remedy: str = "choose another file") -> None:
     """Raise ValueError for a file that exists already: no command replaces one. /dev/null and the like may exist.
 
-    Call it before anything takes long, or is asked of a drive.
+    Call it before anything that takes long or uses a drive.
     """
     if file.is_file():
         raise ValueError(f"{file} exists already, and files are not overwritten; {remedy}")
@@ -391,7 +391,7 @@ def check_writable(file: Path) -> None:
 
 
 def ask(question: str, yes: bool) -> None:
-    """Continue if the user agrees; else each program's `errors_as_exit_codes` ends it under its own name.
+    """Return if the user agrees; otherwise raise, and `errors_as_exit_codes` ends the program.
 
     Raises:
         ValueError: If there is no terminal to ask.
@@ -406,14 +406,14 @@ def ask(question: str, yes: bool) -> None:
 
 
 def scales_of(drives: BusDrives) -> list[Scale]:
-    """Return the scale of every axis' units, as far as the drive tells it."""
+    """Return the scale of every axis' units, as far as the drive reports it."""
     from drive_env.dictionary import quantities
 
     return quantities.scales_of(drives, drives.description.dictionary)
 
 
 def default_objects(known: ObjectDictionary, names: Iterable[str]) -> list[str]:
-    """Return those of a command's default objects that a drive has: a stepper's tells no current."""
+    """Return those of a command's default objects that a drive has: a stepper's has no current."""
     return [name for name in names if known.has(object_name(name))]
 
 
@@ -430,12 +430,12 @@ def cycle_for(known: Description) -> float | None:
 
 
 def axes_of(drives: BusDrives, entry: Entry, axis: int | None) -> list[int]:
-    """Return the axes whose object an entry is: all, or the one that was asked for, of every node.
+    """Return the axes of an entry: all, or the requested one, of every node.
 
-    An object of a further axis is of that axis alone, and what belongs to the node is the first axis'.
+    An object of a further axis belongs only to that axis, and an object of the node to the first axis.
 
     Raises:
-        ValueError: For an axis that the nodes do not have, or that the object does not belong to.
+        ValueError: For an axis that the nodes lack, or that the object does not belong to.
     """
     known, key = drives.description, (entry.index, entry.sub)
     count = known.num_axes
@@ -450,7 +450,7 @@ def axes_of(drives: BusDrives, entry: Entry, axis: int | None) -> list[int]:
 
 
 def axes_of_nodes(drives: BusDrives, axis: int | None) -> list[int]:
-    """Return all axes, or the one that was asked for, of every node; ValueError for one that the nodes do not have."""
+    """Return all axes, or the requested one, of every node; ValueError for one that the nodes lack."""
     count = drives.description.num_axes
     if axis is not None and not 0 <= axis < count:
         raise ValueError(f"--axis {axis}: a {drives.description.name} has {count} axes, from 0")

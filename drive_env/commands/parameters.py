@@ -104,7 +104,7 @@ def diff(
         if other is not None:
             if names_a_bus(context):
                 raise ValueError(f"{file} is compared with {other}, and with no drive; leave the bus out, or {other}")
-            dictionary = describe(bus.device, eds, on_ethercat=True).dictionary  # either file may be of that bus
+            dictionary = describe(bus.device, eds, on_ethercat=True).dictionary  # each file may be from EtherCAT
             wanted, found = load_parameters(file, dictionary), load_parameters(other, dictionary)
             _tell_of_changes(file)
             _tell_of_changes(other)
@@ -209,25 +209,25 @@ def _exchange(
     json: bool,
     dry_run: bool,
 ) -> None:
-    """Write parameters, and print the drive's values as another connection reads them then.
+    """Write parameters, and print the drive's values read by another connection.
 
     Args:
         bus: The axis.
-        eds: What describes the drive in place of its device.
+        eds: EDS of the drive instead of its device.
         wanted: The parameters.
         name: Their source.
         check: Raises for a drive that they are not meant for.
-        store: Have the drive keep them.
-        yes: Do not ask.
-        json: Print JSON.
-        dry_run: Say what would be written, and write nothing.
+        store: Whether the drive stores them.
+        yes: Whether to skip the question.
+        json: Whether to print JSON.
+        dry_run: Whether to print only what would be written.
     """
     from drive_env.fieldbus.description import describe
     from drive_env.master import parameters
 
     axis, node = bus.one_axis, bus.number
     wanted = parameters.restorable(wanted, describe(bus.device, eds).hints)
-    if dry_run:  # to open a node that is stopped would send it an NMT command
+    if dry_run:  # opening a stopped node would send it an NMT command
         bus.look_first(eds)
     with ExitStack() as written:
         with bus.connect(eds, safety=False) as drives:
@@ -248,7 +248,7 @@ def _exchange(
             written.enter_context(told_if_interrupted(f"{len(changes)} written to node {node}{told}"))
             if store:
                 drives.write((0x1010, 1), parameters.SAVE)
-        # What was just written is not believed to whom wrote it: another connection reads it anew.
+        # The written values are verified by another connection, which reads them anew.
         with bus.connect(eds, safety=False) as drives:
             left = parameters.compare(drives, wanted, axis)
     if left:
@@ -268,7 +268,6 @@ def _exchange(
 
 
 def _tell_plan(differences: list[Any], scale: Scale, node: int, *, store: bool, json: bool) -> None:
-    """Print the parameters that would be written."""
     if json:
         rows = [_row(difference, scale) for difference in differences]
         print_json({"would change": rows, "would store": store, "written": 0})
@@ -278,7 +277,7 @@ def _tell_plan(differences: list[Any], scale: Scale, node: int, *, store: bool, 
 
 
 def _tell_of_changes(file: Path) -> None:
-    """Say on stderr that a file is not as it was written: to compare with it, it need not be."""
+    """Print on stderr that a file was changed after it was written, which a comparison allows."""
     from drive_env.master.parameter_files import checked_origin
     from drive_env.whole_file import FileChangedError
 

@@ -16,12 +16,12 @@ from drive_env.commands.compile_bar import show_compiling
 from drive_env.programs import INTERRUPTED, USER_ERROR
 
 PACKAGES = ("mechanics", "drive_env", "tuning", "agents")
-AGAIN = 10.0  # s, after which a line that was printed is printed again
-OTHER_NAMES = {"position": "node"}  # options that go by a second name: on EtherCAT a node is known by its position
+AGAIN = 10.0  # s after which a repeated line is printed again
+OTHER_NAMES = {"position": "node"}  # second names of options: on EtherCAT a node is known by its position
 
 
 def _option_named(name: str) -> str:
-    """Return an option's own name, without hyphens, of any that it goes by."""
+    """Return an option's own name, without hyphens, for any of its names."""
     return OTHER_NAMES.get(name, name)
 
 
@@ -30,7 +30,7 @@ CONTEXT: dict[str, Any] = {"help_option_names": ["-h", "--help"], "token_normali
 
 
 class RepeatedLines(logging.Filter):
-    """Leaves out a line that was printed a moment ago: a bus that is gone fails every frame of a stop with the same."""
+    """Suppresses a line that was printed a moment ago: a lost bus fails every frame of a stop with the same line."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -59,24 +59,24 @@ Verbose = Annotated[bool, typer.Option("--verbose", help="Print more about what 
 
 
 def answer_old_name(program: str, old: str, new: str) -> NoReturn:
-    """End a command that was called by its old name, and tell the new one."""
+    """End a command that was called by its old name, naming the new one."""
     print(f"{program}: `{program} {old}` is `{new}` now", file=sys.stderr)
     raise typer.Exit(USER_ERROR)
 
 
 class Program(typer.Typer):
-    """The application of a program: its commands are put into it, and `run` runs the one that is asked for.
+    """The application of a program: contains its commands, and `run` runs the requested one.
 
     Args:
-        name: The program's.
-        interrupted: What is said of a command that Ctrl-C ends before it can say anything itself.
+        name: Name of the program.
+        interrupted: Message for a command that Ctrl-C ends before it can print one itself.
     """
 
     def __init__(self, name: str, interrupted: str = "interrupted") -> None:
         super().__init__(
             name=name,
             no_args_is_help=True,
-            rich_markup_mode="markdown",  # in "rich", units in brackets would be taken for markup
+            rich_markup_mode="markdown",  # in "rich", units in brackets would be parsed as markup
             pretty_exceptions_enable=False,
             context_settings=CONTEXT,
         )
@@ -107,10 +107,10 @@ class Program(typer.Typer):
 
 
 def say_as_much(quiet: bool, verbose: bool) -> None:
-    """Let warnings and the log of our packages through, or not.
+    """Show or hide warnings and the log of our packages.
 
     Raises:
-        typer.BadParameter: For both.
+        typer.BadParameter: If both are given.
     """
     if quiet and verbose:
         raise typer.BadParameter("--quiet and --verbose exclude each other")
@@ -119,7 +119,7 @@ def say_as_much(quiet: bool, verbose: bool) -> None:
         logging.disable(logging.WARNING)
     else:  # a program that is silent for half a minute seems to hang
         show_compiling()
-    printer = logging.lastResort  # what prints warnings while no handler is set up
+    printer = logging.lastResort  # prints warnings while no handler is configured
     if printer is not None and not any(isinstance(one, RepeatedLines) for one in printer.filters):
         printer.addFilter(RepeatedLines())
     if verbose:

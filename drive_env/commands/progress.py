@@ -1,4 +1,4 @@
-"""Bars of work under way, on stderr; none where a program was asked to be quiet."""
+"""Bars of work under way, on stderr; none with --quiet."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress
 
-# Bars that are on the terminal now, the last on top: a second display beside one would tear both.
+# Bars on the terminal, the last one on top: a second display beside them would garble both.
 shown: list[Progress] = []
 
 
@@ -38,5 +38,5 @@ def progress_on(console: Console, *, transient: bool = False) -> Progress:
 
 
 def is_quiet() -> bool:
-    """Return whether the program that runs was asked to be quiet: warnings are off."""
+    """Return whether the program runs with --quiet: warnings are off."""
     return not logging.getLogger("drive_env").isEnabledFor(logging.WARNING)

@@ -1,4 +1,4 @@
-"""`drive-env serve --ready-file`: where emulated drives can be reached, as JSON for scripts."""
+"""`drive-env serve --ready-file`: the address of emulated drives, as JSON for scripts."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from drive_env.bus.transport import Transport
     from drive_env.ethercat.ways import EtherCatWay
 
-OWNER_ONLY = 0o077  # of the umask: who reads the token may move the drives
+OWNER_ONLY = 0o077  # umask: a reader of the token could move the drives
 
 
 def can_address(transport: Transport, interface: str | None, channel: str | None) -> dict[str, Any]:
@@ -34,12 +34,12 @@ def ethercat_address(way: EtherCatWay, interface: str | None) -> dict[str, Any]:
 
 @contextmanager
 def told_ready(path: Path | None, address: Mapping[str, Any], fail: Callable[[str], NoReturn]) -> Iterator[None]:
-    """Have a file while a block serves: the address without what is None, and the process; None writes no file.
+    """Provide a file while a block serves: the address without None values, and the process; None: no file.
 
     Args:
-        path: The file; it is written whole, for its owner alone.
-        address: What it says besides the process.
-        fail: Ends the command with a message where the file cannot be written.
+        path: The file; it is written atomically, readable only by its owner.
+        address: Its content besides the process.
+        fail: Ends the command with a message if the file cannot be written.
     """
     from drive_env.whole_file import write_whole
 
@@ -57,5 +57,5 @@ def told_ready(path: Path | None, address: Mapping[str, Any], fail: Callable[[st
     try:
         yield
     finally:
-        if path.is_file():  # a device stays
+        if path.is_file():  # a device file is not removed
             path.unlink(missing_ok=True)

@@ -1,6 +1,6 @@
-"""Frames of a log that anybody may have recorded, read in a process with limits.
+"""Frames of an untrusted log, read in a process with limits.
 
-A .blf and a .gz are packed, and a .db holds whatever its writer put there: none says how much comes of it.
+A .blf and a .gz are compressed, and a .db may have any content: their unpacked size is unknown.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from mechanics.reading.limited_child import call_limited
 from mechanics.reading.untrusted import MOST_RECORDING, check_size
 
 MEMORY = 4_000_000_000  # bytes for the frames that are sent, some 10^7
-LONGEST_REASON = 200  # letters of what python-can says of a broken place: it may repeat a line
+LONGEST_REASON = 200  # letters of python-can's message about a broken place, which may repeat a line
 TIME = 900.0  # s of the processor; MOST_RECORDING takes a tenth of it
 
 
 class RecordedFrame(NamedTuple):
-    """A frame of 11 bits: its time stamp [s], identifier, data, and whether and for how many bytes it asks."""
+    """A frame with an 11-bit identifier: time stamp [s], identifier, data, length requested by a remote frame."""
 
     timestamp: float
     arbitration_id: int
@@ -45,7 +45,7 @@ def read_frames(file: Path, *, everything: bool) -> tuple[list[RecordedFrame], i
 
 
 def ending_of(file: Path) -> str:
-    """Return the ending that gives a log's format: of a log that is packed, the one before `.gz`."""
+    """Return the ending for a log's format: for a compressed log, the one before `.gz`."""
     return Path(file.stem if file.suffix.lower() == ".gz" else file.name).suffix.lower()
 
 
@@ -71,7 +71,7 @@ def _frames_as_bytes(file: Path, everything: bool) -> bytes:
         raise ValueError(f"{file} cannot be read as .gz: {error}") from None
     except OSError as error:
         raise ValueError(f"{file} cannot be read: {error.strerror}") from None
-    except Exception as error:  # each format's reader raises what the broken place leads to
+    except Exception as error:  # each format's reader raises any exception for a broken place
         why = str(error).partition(";")[0]
         why = why if len(why) <= LONGEST_REASON else f"{why[:LONGEST_REASON]}..."
         raise ValueError(
@@ -113,7 +113,7 @@ def _is_taken(frame: Any, everything: bool) -> bool:
 
 
 def _is_from_a_master(frame: Any) -> bool:
-    """Return whether the predefined connection set has a master send this identifier."""
+    """Return whether a master sends this identifier in the predefined connection set."""
     from drive_env.canopen.frames import ERROR_CONTROL, NMT, RPDO, SDO_REQUEST, SYNC
     from drive_env.master.can.error_control import MASTERS
 

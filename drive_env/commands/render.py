@@ -15,7 +15,7 @@ from drive_env.commands.progress import progress_on
 from drive_env.programs import CLOSED, output_is_closed
 from mechanics.reading.untrusted import read_text
 
-# Whatever takes long to import (the compiler, MuJoCo, matplotlib) is imported when it is needed.
+# Slow imports (the compiler, MuJoCo, matplotlib) are made when they are needed.
 
 
 def render(
@@ -62,7 +62,7 @@ def render(
                 "a film is written"
             )
         if film is not None:
-            new_context(16, 16).free()  # before the run, and before anything imports MuJoCo, which may fail for it
+            new_context(16, 16).free()  # before the run and any import of MuJoCo, which would fail without it
         _render(row, film, view)
     except (DemonstrationError, OpenGLError, PictureFileError) as error:
         fail(error, USER_ERROR)
@@ -96,7 +96,7 @@ def _render(row: Any, film: Path | None, view: bool) -> None:
 
 
 def _with_overrides(config: Path, **overrides: str | int | None) -> str:
-    """Return the run's TOML with its comments, the overridden values in their place."""
+    """Return the run's TOML with comments and overridden values."""
     text = read_text(config)
     for key, value in overrides.items():
         if value is not None:

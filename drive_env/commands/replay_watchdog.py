@@ -1,4 +1,4 @@
-"""The watchdog for the death of `drive-env frames replay`: heartbeat consumers of the drives, set while it runs."""
+"""The watchdog for a crash of `drive-env frames replay`: heartbeat consumers of the drives, set while it runs."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from drive_env.master.can.sdo import SdoClient
 
 SILENCE = 0.5  # s after which a drive acts
 PERIOD = SILENCE / 3.0  # two heartbeats may be lost
-MOST_CONSUMERS = 8  # entries of 1016h that are looked at
+MOST_CONSUMERS = 8  # entries of 1016h that are checked
 MAX_AXES = 8
 CONSUMERS, GUARD_TIME, LIFE_FACTOR, ERROR_BEHAVIOUR = 0x1016, 0x100C, 0x100D, (0x1029, 1)
 QUICK_STOP, NO_ACTION = 3, 0  # of 6007h
 RAMPS, COASTS = 2, 0  # of 605Ah, the quick stop's option
-# NMT commands; nothing of 1016h is left after the resets.
+# NMT commands; resets delete the settings of 1016h.
 START, RESETS = 0x01, (0x81, 0x82)
 
 
 class ReplayWatchdog:
-    """Heartbeats of this process, and the consumers of the nodes that frames are sent to.
+    """Heartbeats of this process, and the heartbeat consumers of the addressed nodes.
 
     Args:
         port: The bus.
-        frames: What is to be sent (python-can messages).
+        frames: Frames to send (python-can messages).
         timeout: Longest wait for an answer [s].
     """
 
@@ -41,18 +41,18 @@ class ReplayWatchdog:
         self._port = port
         self._timeout = timeout
         self._heartbeats: Heartbeats | None = None
-        self._before: dict[int, dict[Key, bytes]] = {}  # node -> what its objects had
+        self._before: dict[int, dict[Key, bytes]] = {}  # node -> previous values of its objects
         self._own, self._left = nodes_watched_by(frames)
         self._ended = threading.Event()
         self._thread: threading.Thread | None = None
 
     def arm(self, nodes: Sequence[int]) -> list[str]:
-        """Have nodes watch over this process; return in words which cannot."""
+        """Make nodes watch this process; return texts about those that cannot."""
         without = []
         self._heartbeats = Heartbeats(self._port, nodes)
         self._heartbeats.choose()
         self._thread = threading.Thread(target=self._beat, name="heartbeats of replay", daemon=True)
-        self._thread.start()  # before a drive begins to wait for them
+        self._thread.start()  # before a drive begins to expect them
         for node in nodes:
             if node in self._own:
                 continue  # the recorded master's own, whose heartbeats are among the frames
@@ -64,10 +64,10 @@ class ReplayWatchdog:
         return without
 
     def give_up(self, nodes: Iterable[int]) -> list[str]:
-        """Give nodes whose motors are proved off their settings back; the others stop by themselves.
+        """Restore the settings of nodes whose motors are proved off; the others stop by themselves.
 
         Returns:
-            What could not be put back, in words.
+            Texts about settings that could not be restored.
         """
         problems: list[str] = []
         for node in nodes:
@@ -98,10 +98,10 @@ class ReplayWatchdog:
                 return  # the drives notice
 
     def _arm_node(self, node: int) -> str:
-        """Set a node's consumer and its reaction; return why not."""
+        """Set a node's consumer and its reaction; return why it failed, or ""."""
         objects = SdoClient(self._port, node)
         try:
-            # A drive may watch its master in NMT operational alone, as the TMCM-1636 does.
+            # A drive may watch its master only in NMT operational, like the TMCM-1636.
             self._port.send(NMT, bytes((START, node)))
             consumer = self._free_consumer(objects)
             if consumer is None:
@@ -133,7 +133,7 @@ class ReplayWatchdog:
         return None
 
     def _read(self, objects: SdoClient, key: Key) -> bytes | None:
-        """Return an object's bytes, None where the node has none such."""
+        """Return an object's bytes, None if the node lacks it."""
         try:
             return objects.read(*key, f"{key[0]:04X}h:{key[1]:02X}", self._timeout)
         except ObjectAccessError:
@@ -142,7 +142,7 @@ class ReplayWatchdog:
     def _change(self, node: int, objects: SdoClient, key: Key, data: bytes) -> None:
         label = f"{key[0]:04X}h:{key[1]:02X}"
         before = objects.read(*key, label, self._timeout)[: len(data)]
-        # Remembered first: an answer that is lost says nothing of whether it was taken.
+        # Stored first: a lost answer does not show whether the write succeeded.
         self._before.setdefault(node, {})[key] = before
         objects.write(*key, data, label, self._timeout)
         if (found := objects.read(*key, label, self._timeout)[: len(data)]) != data:
@@ -150,7 +150,7 @@ class ReplayWatchdog:
 
 
 def nodes_watched_by(frames: Iterable[Any]) -> tuple[set[int], dict[int, str]]:
-    """Return the nodes whose watch over a master the frames set, and those left without one, why (0: all)."""
+    """Return the nodes whose watchdog the frames set, and those left without one, with the reason (0: all)."""
     own: set[int] = set()
     left: dict[int, str] = {}
     for frame in frames:

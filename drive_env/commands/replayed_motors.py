@@ -1,6 +1,6 @@
-"""The motors that replayed frames may have enabled: which nodes were spoken to, whether they are live, and their stop.
+"""The motors that replayed frames may have enabled: the addressed nodes, whether they are live, and their stop.
 
-Nothing is concluded from the frames but who may have obeyed them: whether an axis is live its statusword says.
+The frames only show which nodes may have obeyed them: whether an axis is live is read from its statusword.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from drive_env.master.can.sdo import SdoClient
 
 ANSWER_TIMEOUT = 0.5  # s
 MAX_AXES = 8  # of a node (CiA 301: eight profile areas)
-RAMP = 10.0  # s, the longest that a quick stop may take, measured or to be expected
-JUDGED_AFTER = 0.5  # s, from which on a ramp is judged by what it has done
-LOOK = 0.05  # s between two looks at a position
+RAMP = 10.0  # s, the longest quick stop, measured or expected
+JUDGED_AFTER = 0.5  # s after which a ramp is judged by its deceleration
+LOOK = 0.05  # s between two reads of a position
 REST = 0.005  # revolutions in that time: 6 rpm
-REST_INC = 32  # increments in that time, where the drive says nothing of a revolution
+REST_INC = 32  # increments in that time, if the revolution is unknown
 AT_REST_LOOKS = 2  # in a row
 OFF_TIME = 2.0  # s that a drive may take to switch off
 
@@ -40,9 +40,9 @@ class Stopped(NamedTuple):
     """An axis that was live when the frames ended.
 
     Attributes:
-        node, axis: Which.
+        node, axis: The axis.
         statusword: 6041h afterwards.
-        cut: Why its voltage was switched off while it turned; "" where it came to rest by its quick stop.
+        cut: Why its voltage was switched off while it turned; "" if it came to rest by its quick stop.
     """
 
     node: int
@@ -58,11 +58,11 @@ class Stopped(NamedTuple):
 
 
 class ReplayedMotors:
-    """The drives that frames are sent to again.
+    """The drives that receive the replayed frames.
 
     Args:
         port: The bus.
-        frames: What is to be sent (python-can messages).
+        frames: Frames to send (python-can messages).
         timeout: Longest wait for an answer [s].
     """
 
@@ -70,8 +70,8 @@ class ReplayedMotors:
         self._port = port
         self._timeout = timeout
         self._nodes = nodes_spoken_to(frames)
-        self._there: set[int] = set()  # nodes that were heard of
-        self._no_drives: set[int] = set()  # they answer, and have no statusword
+        self._there: set[int] = set()  # nodes that were heard
+        self._no_drives: set[int] = set()  # nodes that answer without a statusword
 
     def check_none_is_live(self) -> None:
         """Raise BusError for a node that another master has enabled."""
@@ -84,23 +84,23 @@ class ReplayedMotors:
             )
 
     def listen(self) -> None:
-        """From now on, note which nodes are heard."""
+        """Begin to note the nodes that are heard."""
         for node in self._nodes:
             for base in (EMCY, *TPDO, SDO_RESPONSE, ERROR_CONTROL):
                 self._port.subscribe(base + node, partial(self._hear, node))
 
     def drives(self) -> list[int]:
-        """Return the nodes that were heard of and have a statusword."""
+        """Return the nodes that were heard and have a statusword."""
         return sorted(self._there - self._no_drives)
 
     def stop(self) -> tuple[list[Stopped], list[str]]:
-        """Stop live axes: quick stop, off at rest, and a look at the statusword.
+        """Stop live axes: quick stop, off at rest, and a check of the statusword.
 
-        Returns the axes that were, and in words what could not be proven to be off.
+        Returns the axes that were live, and texts about those that could not be proved off.
         """
         stopped: list[Stopped] = []
         unproven: list[str] = []
-        # Nodes that are known to be there answer at once; no motor may run on while others are waited for.
+        # Known nodes answer at once; no motor may run on while others are waited for.
         for nodes in (sorted(self._there), [node for node in self._nodes if node not in self._there]):
             known = bool(self._there.intersection(nodes))
             try:
@@ -132,7 +132,7 @@ class ReplayedMotors:
         self._there.add(node)
 
     def _statuswords(self, nodes: Iterable[int]) -> dict[Axis, int]:
-        """Return 6041h of every axis of the nodes that answer, all nodes being asked side by side."""
+        """Return 6041h of every axis of the nodes that answer, with all nodes asked in parallel."""
         found: dict[Axis, int] = {}
         asked = list(nodes)
         for part in range(MAX_AXES):
@@ -167,12 +167,12 @@ class ReplayedMotors:
 def stop_axes(
     port: Port, clients: Mapping[int, ObjectClient], axes: Sequence[Axis], timeout: float
 ) -> list[Stopped | str]:
-    """Quick-stop axes, all at once, and switch each off at rest; return how each ended, or which are not off.
+    """Quick-stop axes, all at once, and switch each off at rest; return how each ended, or why it is not off.
 
     Args:
         port: The bus.
         clients: The clients of their nodes.
-        axes: Those that may be live.
+        axes: Axes that may be live.
         timeout: Longest wait for an answer [s].
     """
     stops = [_Stop(port, clients[axis[0]], axis, timeout) for axis in axes]
@@ -190,7 +190,7 @@ def stop_axes(
 
 
 class _Stop:
-    """One axis on its way to rest and off; a lost answer is no reason to leave off."""
+    """The stop of one axis; it continues after a lost answer."""
 
     def __init__(self, port: Port, sdo: ObjectClient, axis: Axis, timeout: float) -> None:
         self._port, self._sdo, self._axis, self._timeout = port, sdo, axis, timeout
@@ -212,7 +212,7 @@ class _Stop:
         self._start = time.monotonic()
 
     def read_scale(self) -> None:
-        """Read the scale of positions, of which a small way counts as rest."""
+        """Read the position scale, which defines the distance that counts as rest."""
         for index, sub in _scales():
             scale = self._read(index + (self._offset if index in cia402.PROFILE_AREAS else 0), sub)
             if scale:
@@ -220,7 +220,7 @@ class _Stop:
                 break
 
     def look(self) -> None:
-        """Look at statusword and position, and take the next step of the stop."""
+        """Read statusword and position, and take the next step of the stop."""
         now = time.monotonic()
         word = self._read(cia402.STATUSWORD + self._offset)
         if word is not None and not cia402.is_live(word):
@@ -279,7 +279,7 @@ class _Stop:
 
     @contextmanager
     def _tried(self) -> Iterator[None]:
-        """Go on after an error; a silent node may be stopped (NMT), as one is that misses its master: wake it."""
+        """Continue after an error; a silent node may be stopped (NMT) since it misses its master: wake it."""
         try:
             yield
         except (BusError, ObjectAccessError) as error:
@@ -290,7 +290,7 @@ class _Stop:
 
 
 def nodes_spoken_to(frames: Iterable[Any]) -> tuple[int, ...]:
-    """Return the nodes that may obey frames; who listens to a PDO its mapping alone says: then it may be any node."""
+    """Return the nodes that may obey frames; for a PDO that may be any node, by its mapping."""
     nodes: set[int] = set()
     for frame in frames:
         can_id, data = frame.arbitration_id, bytes(frame.data)

@@ -79,7 +79,6 @@ def scan(
 
 
 def _scan_ethercat(interface: str | None, channel: str | None, json: bool) -> None:
-    """Print the slaves of a segment."""
     from drive_env.devices import device_of
     from drive_env.master.ethercat.state_names import state_name
     from drive_env.master.ethercat_drives import open_frames
@@ -112,7 +111,7 @@ def _find(port: Any, first: int, last: int, timeout: float) -> set[tuple[int, st
     states = {4: "stopped", 5: "operational", 127: "pre-operational"}
 
     def hear(node: int, data: bytes) -> None:
-        if data == bytes(1):  # it has booted: where it is now it does not say
+        if data == bytes(1):  # it has booted, which does not show its present state
             heard.setdefault(node, "")
             return
         heard[node] = states.get(data[0] & 0x7F, "unknown") if data else "unknown"
@@ -135,7 +134,7 @@ def _look(port: Any, node: int, state: str, answers: int, timeout: float) -> dic
 
     sdo = SdoClient(port, node)
     row: dict[str, Any] = {"node": node, "state": state}
-    if answers > 1:  # of which each object would be one's or the other's
+    if answers > 1:  # each object would be one's or the other's
         return row | {"answers": answers}
 
     def read(index: int, sub: int) -> bytes | None:
@@ -174,7 +173,7 @@ def _print(found: list[dict[str, Any]], timeout: float) -> None:
         late = ", ".join(row.get("timed out", ()))
         late = f"no answer to {late} within {timeout:g} s; try a longer --timeout" if late else ""
         if "device type" not in row:
-            why = late if late and row["state"] != "stopped" else "no SDO answer"  # of a stopped node none comes
+            why = late if late and row["state"] != "stopped" else "no SDO answer"  # a stopped node never answers
             print_lines([f"node {row['node']}  {why}" + (f" ({row['state']})" if row["state"] else "")])
             continue
         profile = row["device type"] & 0xFFFF

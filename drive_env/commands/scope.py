@@ -36,14 +36,14 @@ if TYPE_CHECKING:
 # Response and commands of the usual modes: what `drive-env model` needs.
 DEFAULT = ("6062", "6064", "606C", "60FF", "6077")
 OF_VL = ("6043", "6042", "6044", "6077")  # of a drive without pv
-LISTENED = 0.3  # how long other masters are listened for before anything is sent [s]
-CHUNK = 0.05  # recorded at a time while the trigger is waited for [s]
-PIECE = 0.25  # recorded at a time afterwards [s]: as much is lost at most where the recording is broken off
+LISTENED = 0.3  # s to listen for other masters before anything is sent
+CHUNK = 0.05  # s recorded at a time while waiting for the trigger
+PIECE = 0.25  # s recorded at a time afterwards: the most that is lost if the recording is interrupted
 _TRIGGER = re.compile(r"^\s*(.+?)\s*(<=|>=|<|>|==|!=)\s*(.+?)\s*$")
 
 
 class Trigger(NamedTuple):
-    """A condition on an object: it fires where the condition begins to hold."""
+    """A condition on an object: it fires when the condition becomes true."""
 
     entry: Any
     relation: str
@@ -112,12 +112,12 @@ def scope(
 
 
 def default_names(known: ObjectDictionary) -> tuple[str, ...]:
-    """Return the objects that are recorded where none are named; a drive need not have them all."""
+    """Return the default objects to record; a drive may lack some."""
     return DEFAULT if known.has(cia402.TARGET_VELOCITY) or not known.has(cia402.VL_TARGET_VELOCITY) else OF_VL
 
 
 def new_files(out: Path) -> tuple[Path, Path]:
-    """Return where table and picture go; ValueError where they cannot be written, or are there."""
+    """Return the paths of table and picture; ValueError if they cannot be written, or exist."""
     if not out.parent.is_dir():
         raise ValueError(f"there is no folder {out.parent}; choose another --out")
     table, picture = out.with_suffix(".csv"), out.with_suffix(".png")
@@ -130,13 +130,13 @@ def new_files(out: Path) -> tuple[Path, Path]:
 def refuse_other_masters(
     interface: str | None, channel: str | None, nodes: list[int] | None, bitrate: int | None
 ) -> None:
-    """Raise OtherMastersError where another master is at work; nothing is sent."""
+    """Raise OtherMastersError if another master is active; nothing is sent."""
     from drive_env.master.can.other_masters import OtherMasters
     from drive_env.master.can.port import Port, open_bus
     from drive_env.master.open_drives import default_nodes, is_ethercat
 
     if is_ethercat(interface):
-        return  # who opens a segment takes it over
+        return  # opening a segment takes it over in any case
     port = Port(open_bus(interface, channel, **({} if bitrate is None else {"bitrate": bitrate})))
     try:
         OtherMasters(port, nodes or default_nodes(interface)).listen(LISTENED)
@@ -160,7 +160,7 @@ def _parse(text: str, known: Any) -> Trigger:
 
 
 def _fires(trigger: Trigger, values: Any, scales: list[Scale]) -> Any:
-    """Return in which rows the condition holds on any of the axes."""
+    """Return the rows in which the condition is true on any of the axes."""
     import operator
 
     import numpy as np
@@ -175,7 +175,7 @@ def _fires(trigger: Trigger, values: Any, scales: list[Scale]) -> Any:
 
 
 class _Samples:
-    """Samples of objects at every SYNC: rows of each entry, (n, len(axes)), as long as no other master is at work."""
+    """Samples of objects at every SYNC: rows of each entry, (n, len(axes)), as long as no other master is active."""
 
     def __init__(self, drives: BusDrives, axes: list[int], entries: list[Any]) -> None:
         self._drives = drives
@@ -197,14 +197,14 @@ class _Samples:
         try:
             trace = self._drives.record(names, round(seconds, 3))
         except BusError:
-            self._others.check()  # samples that stay out are another master's doing, if there is one
+            self._others.check()  # missing samples are another master's doing, if there is one
             raise
         self._drives.link.drain()
         self._others.check()
         return {entry: trace[name][:, self._axes] for entry, name in zip(self._entries, names, strict=True)}
 
     def complete(self, rows: dict[Any, Any], missing: int) -> tuple[dict[Any, Any], BaseException | None]:
-        """Return these rows and as many more, or those that came before Ctrl-C or the loss of the bus, and which."""
+        """Return these rows and `missing` more, or those before Ctrl-C or the loss of the bus, with that exception."""
         from drive_env.fieldbus.errors import BusError
 
         pieces, broken, piece = [rows], None, round(PIECE / 0.001)
@@ -248,15 +248,15 @@ def _record(
 def _wait_for(
     trigger: Trigger, samples: _Samples, scales: list[Scale], keep: int, wait: float
 ) -> tuple[dict[Any, Any], int]:
-    """Return the rows around the trigger, at least `keep` before it if there were so many, and at which row it fired.
+    """Return the rows around the trigger, with up to `keep` before it, and the row at which it fired.
 
-    Where it does not fire within `wait` [s] the command ends.
+    If it does not fire within `wait` [s] the command ends.
     """
     import numpy as np
 
     rows = samples.none()
-    _fires(trigger, np.zeros((1, len(scales)), np.int64), scales)  # a wrong level is reported before the wait
-    held = True  # a condition that holds from the start must end first
+    _fires(trigger, np.zeros((1, len(scales)), np.int64), scales)  # an invalid level is reported before the wait
+    held = True  # a condition that is true from the start must become false first
     for _ in range(max(1, round(wait / CHUNK))):
         chunk = samples.record(CHUNK)
         holds = _fires(trigger, chunk[trigger.entry], scales)

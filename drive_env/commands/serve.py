@@ -26,14 +26,15 @@ if TYPE_CHECKING:
     from drive_env.ethercat.beside_can import BesideCan
     from drive_env.ethercat.ethercat_server import EtherCatServer
 
-PORT = 29636  # no service is registered there, and no system gives it to others
+PORT = 29636  # not a registered service, and no system assigns it to others
 LOOPBACK = "127.0.0.1"
 AUTO = "auto"  # as --token
 NAMES = {"nodes": "--node", "device": "a device", "commissioned": "--factory"}  # of fields with another option name
 NEEDS_CHANNEL = ("socketcan",)  # python-can opens it without one and then receives nothing
 ETHERCAT = ("ethercat", "ethercat-udp")
-TOKEN_BYTES = 12  # of chance: 16 characters
-# SDO of any CiA 402 drive: read the statusword and the device name, write the controlword, make TPDO 1 synchronous.
+TOKEN_BYTES = 12  # random bytes: 16 characters
+# SDO requests for any CiA 402 drive: read the statusword and the device name, write the controlword, make TPDO 1
+# synchronous.
 WARM_UP_REQUESTS = tuple(
     bytes.fromhex(text)
     for text in ("4041600000000000", "4008100000000000", "6000000000000000", "2B40600006000000", "2F00180201000000")
@@ -154,7 +155,7 @@ def serve(
 
 
 def _check_new(file: Path | None) -> None:
-    """End the command where a file to be written exists already, or has no folder."""
+    """End the command if a file to be written exists already, or its folder does not."""
     if file is None:
         return
     try:
@@ -197,7 +198,7 @@ def _serve_ethercat(
     ready_file: Path | None,
     of_can: Mapping[str, object],
 ) -> None:
-    """Serve on EtherCAT; `of_can` are options that it has not."""
+    """Serve on EtherCAT; `of_can` are options that it does not have."""
     from drive_env.commands.serve_ethercat import open_ethercat, run_ethercat
 
     if bus.has_both:
@@ -226,7 +227,7 @@ def _server(
         _fail(f"--channel {channel} needs --interface, e.g. --interface socketcan")
     if interface is not None and token is not None:
         _fail(f"--token is for the hub; --interface {interface} has no tokens")
-    if not listen:  # the system would take it for every address
+    if not listen:  # the system would use it for every address
         _fail(f"--listen must be an address, e.g. {LOOPBACK}; 0.0.0.0 lets the whole network in")
     if not 0 <= port <= 65_535:
         _fail(f"--port {port} must be 0 to 65535")
@@ -246,8 +247,8 @@ def _server(
         except ValueError as error:
             _fail(f"{error}; give --token auto, --token TEXT of 8 characters or more, or --listen {LOOPBACK}")
 
-    # Open for a moment, so that a mistake is told before a minute of compiling; then only when drives answer: a master
-    # that reaches a port behind which kernels are compiled takes the drives for silent, and its frames would pile up.
+    # Opened for a moment, so that mistakes are reported before a minute of compiling; then only when drives answer:
+    # otherwise a master would take the drives for silent, and its frames would pile up.
     open_transport().close()
     _warm_up(bus)
     return Server(world, open_transport())
@@ -265,7 +266,7 @@ def _beside(server: Server, bus: Bus, real_time: bool) -> list[BesideCan]:
 
 
 def _faults(server: Server, orders: list[str], port: int | None) -> list[Control]:
-    """Schedule faults, and return the control socket if one is asked for."""
+    """Schedule faults, and return the control socket if one is requested."""
     from drive_env.bus.bus_faults import BusFaults
     from drive_env.bus.fault_control import Control
     from drive_env.faults.schedule import parse_order
@@ -306,7 +307,7 @@ def _can_port(interface: str, channel: str | None, bit_rate: int) -> Transport:
 
 
 def _warm_up(bus: Bus) -> None:
-    """Do once, on drives that are thrown away, the work of serving: its first time compiles or loads for long."""
+    """Do the work of serving once on temporary drives: the first time compiles or loads for long."""
     from drive_env.bus.config import build_world
     from drive_env.canopen.frames import NMT, SDO_REQUEST, SYNC, Frame
 
@@ -353,10 +354,10 @@ def _announce(
 
 
 def _booted(server: Server, given: int) -> str:
-    """Return the node-ID by which a node boots, and the one that it was given where its store has another."""
+    """Return the node-ID with which a node boots, with the given one if its store has another."""
     from drive_env.canopen.node import Node
 
-    node = server.world.nodes.get(given)  # one without a node-ID has a place of its own
+    node = server.world.nodes.get(given)  # a node without a node-ID has another key
     booted = node.node_id if isinstance(node, Node) else given
     return f"{booted}" if booted == given else f"{booted} (in its store; {given} was given)"
 
@@ -388,7 +389,7 @@ def _ender(server: list[Server | EtherCatServer]) -> Any:
     def end(*_: object) -> None:
         if server:
             server[0].stop()
-        else:  # not by an exception: raised while the compiler calls back into Python it would be lost
+        else:  # not by an exception, which would be lost while the compiler calls back into Python
             print("drive-env: stopped before it began to serve", flush=True)
             os._exit(0)
 

@@ -23,7 +23,7 @@ WARM_UP_CYCLES = 3
 def open_ethercat(
     bus: Bus, real_time: bool, interface: str, channel: str | None, fail: Callable[[str], NoReturn]
 ) -> EtherCatServer:
-    """Return the server of a bus on EtherCAT, its kernels compiled, its way open; `fail` ends the command."""
+    """Return the server of a bus on EtherCAT, its kernels compiled, its transport open; `fail` ends the command."""
     from drive_env.bus.config import BusConfigError
     from drive_env.ethercat.ethercat_server import EtherCatServer
     from drive_env.ethercat.slaves import build_ethercat_world
@@ -40,7 +40,7 @@ def open_ethercat(
         except BusConfigError as error:
             fail(str(error))
 
-    open_way().close()  # a mistake is reported before a minute of compiling
+    open_way().close()  # mistakes are reported before a minute of compiling
     world = build(bus, not real_time)
     first = build(replace(bus, machines=bus.machines[:1], store=None), True)
     first.power_on()
@@ -51,7 +51,7 @@ def open_ethercat(
 
 
 def open_beside(server: Server, bus: Bus, fail: Callable[[str], NoReturn]) -> BesideCan:
-    """Let the slaves of a bus with drives on CAN, too, answer their master; `fail` ends the command."""
+    """Serve the EtherCAT slaves of a bus that also has drives on CAN; `fail` ends the command."""
     from drive_env.bus.config import BusConfigError
     from drive_env.ethercat.beside_can import BesideCan
     from drive_env.ethercat.slaves import build_beside
@@ -71,7 +71,7 @@ def open_beside(server: Server, bus: Bus, fail: Callable[[str], NoReturn]) -> Be
 
 
 def run_ethercat(server: EtherCatServer, bus: Bus, duration: float | None, pcap: Path | None, stats: bool) -> None:
-    """Serve until `duration` [s] is over or a signal ends it; lines are printed for a user."""
+    """Serve until `duration` [s] is over or a signal ends it, printing lines for the user."""
     from drive_env.ethercat.pcap_log import PcapLog
 
     log = None

@@ -1,4 +1,4 @@
-"""Values that begin with a minus: `drive-env set 60FF -1000` means the number, since no option begins with a digit."""
+"""Values that begin with a minus: `drive-env set 60FF -1000` is the number, since no option begins with a digit."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _NEGATIVE = re.compile(r"-\.?\d")
 
 
 class SignedValues(TyperCommand):
-    """A command that takes an argument that looks like a negative number as a value, before `--` as behind it."""
+    """A command that parses an argument like a negative number as a value, also before `--`."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Read the command line; a space in front hides the minus from the parser."""

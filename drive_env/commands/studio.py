@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from drive_env.fieldbus.description import Description
 
 OF_EMULATED = ("load", "motor", "seed", "factory")
-LOOK = 0.02  # s between two looks whether the bus is open
+LOOK = 0.02  # s between two checks whether the bus is open
 
 
 @grouped
@@ -99,7 +99,7 @@ def studio(
         url = server.address(listen, sock.getsockname()[1], ticket)
 
         def ready() -> None:
-            while is_bus and session.state == "opening":  # an emulator may compile for a minute: its page says so
+            while is_bus and session.state == "opening":  # an emulator may compile for a minute: its page shows it
                 time.sleep(LOOK)
             if session.state == "failed":
                 return
@@ -117,7 +117,7 @@ def studio(
 
 
 def check_extra() -> None:
-    """Raise ValueError where the studio's packages are not installed."""
+    """Raise ValueError if the studio's packages are not installed."""
     if importlib.util.find_spec("nicegui") is None:
         raise ValueError("the studio needs NiceGUI, which is not installed: pip install 'drive-env[studio]'")
 
@@ -141,7 +141,7 @@ def _machine(device: str, load: str, motor: str | None, factory: bool, seed: int
 
 
 def _bus(described: Description, bus: NodesOptions, eds: Path | None) -> Callable[[], Drives]:
-    """Return a function that opens drives of a bus with the envelope; it raises where another master commands them."""
+    """Return a function that opens drives of a bus with the envelope; it raises if another master commands them."""
 
     def open_bus() -> Drives:
         refuse_other_masters(bus.interface, bus.channel, bus.nodes, bus.bitrate)

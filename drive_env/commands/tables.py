@@ -18,7 +18,7 @@ class Column(NamedTuple):
     """A column: its title, which may have several lines, and how its cells are set."""
 
     title: str
-    # figure: on the right; name: on the left; text: on the left, on several lines where it is long
+    # figure: right-aligned; name: left-aligned; text: left-aligned, on several lines if it is long
     kind: Literal["figure", "name", "text"] = "figure"
 
 
@@ -35,7 +35,7 @@ def print_table(columns: Sequence[Column], rows: Iterable[Sequence[str]], title:
 
 
 def tables(columns: Sequence[Column], rows: Sequence[Sequence[str]], width: int) -> list[Table]:
-    """Return a table no wider than so many characters, or as many as it takes; each has the first column."""
+    """Return a table of at most `width` characters, or several; each has the first column."""
     from rich import box
     from rich.table import Table
     from rich.text import Text
@@ -73,21 +73,21 @@ def print_names(lists: Mapping[str, Mapping[str, str]]) -> None:
 
 
 def print_text(text: str) -> None:
-    """Print the text of a file as it is.
+    """Print the text of a file unchanged.
 
     Raises:
         OSError: If it cannot be written, with the name of the output and the remedy.
     """
     try:
         print(text, end="", flush=True)
-    except BrokenPipeError:  # the reader has closed the pipe: no error
+    except BrokenPipeError:  # the reader has closed the pipe: not an error
         raise
     except OSError as error:
         raise OSError(error.errno, f"{error.strerror}; print to where there is room", "standard output") from error
 
 
 def print_lines(lines: Iterable[str]) -> None:
-    """Print lines; a terminal gets long ones broken between words, a file or another program gets them whole."""
+    """Print lines; long ones are wrapped on a terminal, but not in a file or pipe."""
     width = terminal_width()
     for line in lines:
         indent = " " * (len(line) - len(line.lstrip()) + GAP)
@@ -100,12 +100,12 @@ def print_lines(lines: Iterable[str]) -> None:
 
 
 def terminal_width() -> int | None:
-    """Return how many characters a line of the terminal has; None where output goes elsewhere."""
+    """Return the terminal's characters per line; None if the output is not a terminal."""
     return shutil.get_terminal_size().columns if sys.stdout.isatty() else None
 
 
 def _widths(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> tuple[list[int], list[int]]:
-    """Return the least width of each column, at which no word is broken, and the one it would like."""
+    """Return each column's least width without broken words, and its preferred width."""
     from rich.cells import cell_len
 
     narrow, wide = [], []
@@ -118,7 +118,7 @@ def _widths(columns: Sequence[Column], rows: Sequence[Sequence[str]]) -> tuple[l
 
 
 def _groups(narrow: Sequence[int], width: int) -> list[list[int]]:
-    """Return which columns stand side by side: the first, and as many others as there is room for."""
+    """Return groups of columns that fit side by side, each with the first column."""
     groups = [[0]]
     for k in range(1, len(narrow)):
         taken = sum(narrow[j] + GAP for j in groups[-1]) + narrow[k]
@@ -129,7 +129,7 @@ def _groups(narrow: Sequence[int], width: int) -> list[list[int]]:
 
 
 def _cut(widths: dict[int, int], narrow: Sequence[int], width: int) -> dict[int, int]:
-    """Return widths that fit beside each other: of the columns that can, the widest gives way first."""
+    """Return widths that fit side by side: the widest column that can shrink is reduced first."""
     cut = dict(widths)
     while sum(cut.values()) + GAP * (len(cut) - 1) > width:
         able = [k for k in cut if cut[k] > narrow[k]]

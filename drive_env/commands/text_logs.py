@@ -1,4 +1,4 @@
-"""Logs of frames as text: those that python-can lacks, and its own ones whose beginning or end it misreads."""
+"""Logs of frames as text: formats that python-can lacks, and those whose beginning or end it misreads."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ CANDUMP = re.compile(
     r"(?:\((?P<time>[^)]*)\)\s+)?\S+\s+(?:[RT]X [-B] [-E]\s+)?(?P<id>[0-9A-F]{3}|[0-9A-F]{8})\s+"
     r"\[(?P<length>\d+)\](?P<data>(?:\s+remote request|(?: +[0-9A-F]{2}(?![0-9A-F]))*))(?P<rest>.*)"
 )
-# BUSMASTER, LogObjectCAN.cpp: time of day in 0.1 ms; s and x are standard and extended, sr and xr ask.
+# BUSMASTER, LogObjectCAN.cpp: time of day in 0.1 ms; s and x are standard and extended, sr and xr remote frames.
 BUSMASTER = re.compile(
     r"(?P<time>\d+:\d+:\d+:\d{4}) [RT]x \d+ (?P<id>\S+) (?P<kind>sr?|xr?) (?P<length>\d+)(?P<data>( [0-9A-F]+)*)", re.I
 )
@@ -25,13 +25,13 @@ HALF_A_DAY, DAY = 43_200.0, 86_400.0  # s
 
 
 class LogError(ValueError):
-    """A log that cannot be read as it is, with the remedy."""
+    """A log that cannot be read, with the remedy."""
 
 
 def whole_lines(file: Any) -> Lines:
-    """Yield the lines of a text, and raise LogError for a last one without an end.
+    """Yield the lines of a text, and raise LogError for an incomplete last one.
 
-    The rest of a frame that was cut is another frame.
+    A truncated frame would be read as another frame.
     """
     for line in file:
         if not line.endswith("\n"):
@@ -40,10 +40,10 @@ def whole_lines(file: Any) -> Lines:
 
 
 def frames_of_text(ending: str, lines: Lines) -> Iterator[Any]:
-    """Return the frames (`can.Message`, times in s) of a log in a format that its ending and its first line tell.
+    """Return the frames (`can.Message`, times in s) of a log in the format given by its ending and its first line.
 
     Raises:
-        LogError: For a line, while it is read, that is no frame, or has no absolute time.
+        LogError: While reading, for a line that is not a frame, or has no absolute time.
     """
     import can
 
@@ -58,13 +58,13 @@ def frames_of_text(ending: str, lines: Lines) -> Iterator[Any]:
         ".log": can.CanutilsLogReader, ".asc": can.ASCReader, ".csv": can.CSVReader
     }  # fmt: skip
     lines = _with_events_line(lines) if ending == ".asc" else lines
-    return iter(readers[ending](line for line in lines))  # it closes what it reads, and a chain cannot be closed
+    return iter(readers[ending](line for line in lines))  # the generator closes its file, which a chain could not
 
 
 def _with_events_line(lines: Lines) -> Lines:
-    """Yield the lines of an .asc with the header as python-can wants it: no blanks, and one line of internal events.
+    """Yield the lines of an .asc with the header that python-can needs: no blanks, and one line of internal events.
 
-    Whatever stands first after date and base it takes for that line, and loses.
+    It treats the first line after date and base as that line, and drops it.
     """
     for line in lines:
         if re.match(r"\s*base\s.*\srelative", line, re.I):
@@ -134,7 +134,7 @@ def _savvycan(lines: Lines) -> Iterator[Any]:
 
 
 def _trc(lines: Lines) -> Iterator[Any]:
-    """Yield the frames of a .trc; what python-can drops with a warning is refused."""
+    """Yield the frames of a .trc; lines that python-can drops with a warning are refused."""
     import can
 
     def refuse(record: logging.LogRecord) -> bool:
@@ -155,7 +155,7 @@ def _with_data(frame: Any, data: list[str], base: int) -> Any:
     return frame
 
 
-# Ending, what the first line that is not blank begins with, reader. candump -L has the frame in one word, with a '#'.
+# Ending, beginning of the first non-blank line, reader. candump -L has the frame in one word, with a '#'.
 FOREIGN: tuple[tuple[str, Callable[[str], Any], Callable[[Lines], Iterator[Any]]], ...] = (
     (".log", lambda first: first.startswith("***BUSMASTER"), _busmaster),
     (".log", lambda first: CANDUMP.match(first.strip()), _candump),

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 FOLDER = Path(__file__).parent
 STANDARD_COMMISSIONING = "standard"
 OF_INDICES = ("timeouts", "commands", "addresses")  # tables of `master` whose keys are indices
-HIGHEST, MASK = "highest", "mask"  # the object's highest value; the bits of its highest value
+HIGHEST, MASK = "highest", "mask"  # the object's highest value; the value's low bits by the mask of its highest value
 
 
 class StageParameter(NamedTuple):
@@ -56,26 +56,26 @@ class StageParameter(NamedTuple):
     source: str
 
 
-AXIS = -1  # in the place of an additional byte that tells the axis
+AXIS = -1  # placeholder of the additional byte that has the axis' number
 
 
 class EmergencyCode(NamedTuple):
-    """Emergency code and the five additional bytes; `AXIS` where a byte tells the number of the node's axis."""
+    """Emergency code and the five additional bytes; `AXIS` for a byte with the number of the node's axis."""
 
     code: int
     extra: tuple[int, ...]
 
     def of_axis(self, axis: int) -> EmergencyCode:
-        """Return it with the bytes that an axis of the node sends; unchanged if it has no byte of the axis."""
+        """Return it with the bytes for an axis of the node; unchanged if no byte has the axis."""
         return EmergencyCode(self.code, tuple(axis if byte == AXIS else byte for byte in self.extra))
 
     @property
     def tells_axis(self) -> bool:
-        """Whether a byte tells the number of the axis."""
+        """Whether a byte has the number of the axis."""
         return AXIS in self.extra
 
     def axis_told(self, extra: tuple[int, ...], num_axes: int) -> int | None:
-        """Decode the axis number from the emergency's bytes; 0 if they carry none, None if they are of another one."""
+        """Decode the axis number from the emergency's bytes; 0 if they carry none, None if not this emergency's."""
         told = {sent for byte, sent in zip(self.extra, extra, strict=True) if byte == AXIS} or {0}
         axis = min(told)
         return axis if axis < num_axes and self.of_axis(axis).extra == extra else None
@@ -93,22 +93,22 @@ class CanopenBehaviour(NamedTuple):
     """Behaviour of a device on a CANopen bus; times in s.
 
     Attributes:
-        sdo_timeout: Time after which the server gives a transfer up.
-        boot_time: From an NMT reset to the boot-up message, where time is real.
-        sdo_time: From an SDO request to its answer, where time is real.
-        store_time: The same of a request that stores or restores parameters (1010h, 1011h).
-        frames_per_cycle: Frames that the firmware takes in a communication cycle of 1 ms, where time is real.
-        receive_buffer: Frames that wait until it does; more are lost.
+        sdo_timeout: Time after which the server aborts a transfer.
+        boot_time: From an NMT reset to the boot-up message, in real time.
+        sdo_time: From an SDO request to its answer, in real time.
+        store_time: The same for a request that stores or restores parameters (1010h, 1011h).
+        frames_per_cycle: Frames that the firmware handles in a communication cycle of 1 ms, in real time.
+        receive_buffer: Frames that may wait for the firmware; further ones are lost.
         inhibit_unit: Unit of a TPDO's inhibit time.
         event_unit: Unit of a TPDO's event timer.
         error_behaviour: Value of 1029h -> NMT state that the node enters, or "stay".
-        objects: Role -> object, of what belongs to the module and not to an axis.
-        save_signature: What 1010h wants to be written.
-        load_signature: What 1011h wants to be written.
-        bootloader_signature: What the bootloader's object wants to be written.
+        objects: Role -> object of the module, not of an axis.
+        save_signature: Value that 1010h requires.
+        load_signature: Value that 1011h requires.
+        bootloader_signature: Value that the bootloader's object requires.
         store_groups: Sub-index of 1010h and 1011h -> sections that it stores and restores.
-        services: Parts of a node that it has beyond what every node has.
-        quirks: Where it differs from the standard.
+        services: Optional services of the node.
+        quirks: Deviations from the standard.
     """
 
     sdo_timeout: float
@@ -130,18 +130,18 @@ class CanopenBehaviour(NamedTuple):
 
 
 class MasterHints(NamedTuple):
-    """Facts about a device that a master needs besides its EDS; times in s.
+    """Facts about a device that a master needs in addition to its EDS; times in s.
 
     Attributes:
         rpdo_type: Transmission type of an RPDO that waits for SYNC.
         timeout: Longest wait for an answer.
-        timeouts: Index -> longest wait, of objects that take longer.
-        turns_positions_round: Objects that change what a position means besides its scale and zero: its direction.
-        unchecked_motion: Objects that change speeds, ramps, counts of a revolution or commutation beside
-            those of CiA 402, by which a master checks them.
-        commands: Index -> its name, of the device's own objects that can be written but are not parameters.
-        addresses: Index -> what it is, of those that a backup keeps and that are never restored: the node would be
-            another one after its next reset, or mute.
+        timeouts: Index -> longest wait, for slow objects.
+        turns_positions_round: Objects that change the direction of positions.
+        unchecked_motion: Objects of the maker that change speeds, ramps, increments per revolution or commutation,
+            while a master checks only those of CiA 402.
+        commands: Index -> name, for the device's own writable objects that are not parameters.
+        addresses: Index -> description, for objects that a backup contains but that are never restored: after its next
+            reset the node would have another address, or be mute.
     """
 
     rpdo_type: int
@@ -154,7 +154,7 @@ class MasterHints(NamedTuple):
 
 
 class Device(NamedTuple):
-    """Everything that makes a device; rates in Hz, otherwise SI."""
+    """All data of a device; rates in Hz, otherwise SI."""
 
     name: str
     title: str
@@ -192,18 +192,18 @@ class Device(NamedTuple):
     variant_of: str = ""
     images: Mapping[int, FixedImage] = MappingProxyType({})  # ready-made process images of EtherCAT, by number
     quirks: DriveQuirks = DriveQuirks()
-    rated_current: float = math.nan  # [A] of peak i_q, the base of thousandths of the rated current or torque
-    commissioning: str = ""  # "standard": presets follow from the motor's data by the rule of any CiA 402 drive
+    rated_current: float = math.nan  # [A] of peak i_q, to which thousandths of the rated current or torque refer
+    commissioning: str = ""  # "standard": presets follow from the motor's data by the rule for any CiA 402 drive
     ethercat: EtherCatBehaviour | None = None
-    about: str = ""  # what a reader of its page must know besides its data
+    about: str = ""  # text on its page in addition to its data
     parts: Mapping[tuple[int, int], Part] = MappingProxyType({})  # objects that show a part of another
-    shared_values: frozenset[tuple[int, int]] = frozenset()  # one value for all axes of a node, whichever is written
-    kept_bits: Mapping[tuple[int, int], int] = MappingProxyType({})  # of a value that is written; others are ignored
+    shared_values: frozenset[tuple[int, int]] = frozenset()  # one value for all axes of a node, written by any of them
+    kept_bits: Mapping[tuple[int, int], int] = MappingProxyType({})  # bits that are stored of a written value
     num_outputs: int = 4
-    without_effect: Mapping[tuple[int, int], str] = MappingProxyType({})  # of the first axis -> why
-    moved: Mapping[str, str] = MappingProxyType({})  # name or index of an earlier version -> what it is now
-    mode_gate: Mapping[int, int] = MappingProxyType({})  # mode of operation -> the drive's own mode that it needs
-    # What process data above an object's range are taken as, `HIGHEST` or `MASK`; of others the object stays as it was.
+    without_effect: Mapping[tuple[int, int], str] = MappingProxyType({})  # key of the first axis -> reason
+    moved: Mapping[str, str] = MappingProxyType({})  # name or index in an earlier version -> its replacement
+    mode_gate: Mapping[int, int] = MappingProxyType({})  # mode of operation -> the manufacturer's mode that it needs
+    # Handling of process data above an object's range, `HIGHEST` or `MASK`; other objects keep their value.
     beyond_range: Mapping[tuple[int, int], str] = MappingProxyType({})
 
     @property
@@ -213,22 +213,22 @@ class Device(NamedTuple):
 
     @property
     def firmware(self) -> Firmware:
-        """The drive's firmware; it is composed at the first look, and compiled at its first use."""
+        """The drive's firmware; composed at the first access, compiled at its first use."""
         return find_firmware(self.firmware_name)
 
     @property
     def motors(self) -> dict[str, Motor]:
-        """The motors of the catalogue that it can turn, by name: of a kind and a voltage class that fit it."""
+        """The catalogue's motors that it can turn, by name: those of a fitting kind and voltage class."""
         return motors_of(motor_kinds(self.firmware_name), self.highest_supply)
 
     @property
     def default_motor(self) -> str:
-        """The motor that its machines have where nothing is said: its firmware's, or the first one that fits it."""
+        """The default motor of its machines: its firmware's, or the first one that fits."""
         usual, known = default_motor(self.firmware_name), self.motors
         return usual if usual in known else next(iter(known), usual)
 
     def check_motor(self, motor: Motor) -> None:
-        """Raise ValueError, with the motors that it turns, for one of another kind or voltage class than these."""
+        """Raise ValueError, listing the motors that it turns, for one of another kind or voltage class."""
         kinds = motor_kinds(self.firmware_name)
         if motor.kind not in kinds:
             raise ValueError(
@@ -244,11 +244,11 @@ class Device(NamedTuple):
             )
 
     def supply_of(self, motor: Motor) -> float:
-        """Return the supply voltage [V] that a motor has on it where nothing is said: its own, or the highest."""
+        """Return the default supply voltage [V] for a motor: the motor's own, limited to the device's highest."""
         return min(motor.voltage, self.highest_supply)
 
     def torque_of(self, motor: Motor) -> float:
-        """Return the torque [N m] that it lets a motor give: the rated one, or that of its largest current."""
+        """Return the torque [N m] of a motor on it: the rated one, or that of its largest current."""
         if self.current_full_scale >= motor.rated_current:
             return motor.rated_torque
         return motor.torque(self.current_full_scale)
@@ -266,12 +266,12 @@ class Device(NamedTuple):
         return 0, index
 
     def is_of_module(self, emergency: str) -> bool:
-        """Return whether an emergency is of all axes of a node: it tells none, though others of the device do."""
+        """Return whether an emergency concerns all axes of a node: it names none, although others of the device do."""
         row = self.emergencies.get(emergency)
         return row is not None and not row.tells_axis and any(one.tells_axis for one in self.emergencies.values())
 
     def is_shared(self, index: int) -> bool:
-        """Return whether the axes of a node have an object in common; a drive with one axis shares nothing."""
+        """Return whether the axes of a node share an object; false for a drive with one axis."""
         ranges = self.axis_offsets
         return bool(ranges) and not any(
             one.first <= index - axis * one.step <= one.last for one in ranges for axis in range(self.num_axes)
@@ -280,10 +280,10 @@ class Device(NamedTuple):
     def preset(self, motor: Motor) -> dict[str, int]:
         """Return the commissioning preset of a motor: object name -> raw value, in the order of writing.
 
-        The one that is written for a motor of the catalogue, else what the device's rule makes of the motor's data.
+        That is the file for a motor of the catalogue, otherwise the result of the device's rule for the motor's data.
 
         Raises:
-            ValueError: For a motor that the drive cannot turn, or for which a device of one's own has no preset.
+            ValueError: For a motor that the drive cannot turn, or for which the user's own device has no preset.
         """
         self.check_motor(motor)
         path = self.presets / f"{motor.name}.toml"
@@ -306,7 +306,7 @@ class Device(NamedTuple):
         return converted_preset(preset, self.new_dictionary(), before, self.bindings)
 
     def _scales_gains_as(self, other: Device) -> bool:
-        """Return whether an integer of a gain is the same gain on both."""
+        """Return whether the raw integers of gains have the same meaning on both."""
         mine, its = (
             (one.current_full_scale, one.current_rate, one.velocity_rate, one.nominal_current) for one in (self, other)
         )
@@ -314,12 +314,12 @@ class Device(NamedTuple):
 
 
 def device_names() -> list[str]:
-    """Return the names of the devices there are."""
+    """Return the names of the known devices."""
     return sorted(path.parent.name for path in FOLDER.glob("*/device.toml"))
 
 
 def device_of(kind: int, vendor: int | None, product: int | None) -> str | None:
-    """Return the name of the device that a node says that it is, None for an unknown one.
+    """Return the name of the known device with a node's identity; None for an unknown one.
 
     Args:
         kind: Its 1000h; a device and its variants, which are one product, are identified by it.
@@ -336,10 +336,10 @@ def device_of(kind: int, vendor: int | None, product: int | None) -> str | None:
 
 @cache
 def find_device(name: str) -> Device:
-    """Return a device by its name, or one of one's own by a path: a variant by its TOML file, a device by its folder.
+    """Return a device by its name, or the user's own by its path: a variant's TOML file, or a device's folder.
 
     Raises:
-        ValueError: For a name that none has, with those there are, or a file or folder that describes none.
+        ValueError: For an unknown name, listing the known ones, or a file or folder that does not describe a device.
     """
     folder = FOLDER / name
     if name not in device_names() and is_own_folder(name):
@@ -367,7 +367,7 @@ def find_device(name: str) -> Device:
 
 
 def _own_device(folder: Path) -> Device:
-    """Return the device in a folder of one's own; ValueError names the file and its mistake."""
+    """Return the user's own device in a folder; ValueError names the file and its mistake."""
     with naming(folder / "device.toml"):
         data = own_data(folder)
         eds = folder / data["eds"]
@@ -456,7 +456,7 @@ def _roles(folder: Path, data: Mapping[str, Any]) -> dict[Role, tuple[int, int]]
 
 
 def allowed_values(data: Mapping[str, Any]) -> dict[tuple[int, int], tuple[int, ...]]:
-    """Return the few values of each object that knows a few only, from a device's data."""
+    """Return the allowed values of each object that has only a few, from a device's data."""
     rows: dict[str, list[int | str]] = dict(data["values"])
     if data["quirks"]["strict_transmission_types"]:
         rows |= data["strict_transmission_types"]
@@ -471,13 +471,13 @@ def _beyond_range(rows: Mapping[str, str]) -> dict[tuple[int, int], str]:
 
 
 def _unsupported(data: Mapping[str, Any]) -> dict[tuple[int, int], str]:
-    """Return the objects whose write is refused, each with the reason; "" where a node has the service."""
+    """Return the objects whose write is refused, each with the reason; "" if it depends on the node's services."""
     reasons = {parse_key(text): reason for text, reason in data.get("reasons", {}).items()}
     return {**dict.fromkeys(map(parse_key, data["objects"]), ""), **reasons}
 
 
 def _emergency(row: Mapping[str, Any]) -> EmergencyCode:
-    """Return the row of an emergency: five bytes, of which "axis" is the number of the axis."""
+    """Return the row of an emergency: five bytes, with "axis" for the number of the axis."""
     found = tuple(AXIS if byte == "axis" else byte for byte in row["bytes"])
     if len(found) != 5 or any(not isinstance(byte, int) or not AXIS <= byte <= 255 for byte in found):
         raise ValueError(f'bytes = {row["bytes"]} of an emergency are five of 0 to 255, or "axis" in place of one')
@@ -485,7 +485,7 @@ def _emergency(row: Mapping[str, Any]) -> EmergencyCode:
 
 
 def _values(item: int | str) -> Sequence[int]:
-    """Return one value as it is, or all of a range such as "0...240"."""
+    """Return a single value as a list, or all values of a range such as "0...240"."""
     if isinstance(item, int):
         return (item,)
     first, last = item.split("...")

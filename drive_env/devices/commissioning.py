@@ -1,7 +1,7 @@
-"""Commissioning of a drive for a motor, from the motor's data alone; a preset that is written goes before it.
+"""Commissioning of a drive for a motor from the motor's data; used if there is no written preset.
 
-What is written is to move any sound machine, not to be good. `preset` follows a device's `commissioning.toml`: objects
-in the order of writing, each with an integer, or with a quantity of the rule:
+The values are meant to move any sound machine, not to be optimal. `preset` follows a device's `commissioning.toml`:
+objects in the order of writing, each with an integer, or with a quantity of the rule:
 
     rule = "servo"                                          # or "stepper"
     [objects]
@@ -10,8 +10,8 @@ in the order of writing, each with an integer, or with a quantity of the rule:
     "Profile velocity" = { of = "speed", times = 65536, per = 60 }
     "Hall Polarity" = { of = "hall_polarity", unless = 0 }  # left out where the quantity is that
 
-`standard_preset` needs no file: it writes what a drive's bindings tell it of, each value in the unit that they name.
-With one (rule = "standard") the objects listed there have the values given there instead, whatever the motor.
+`standard_preset` needs no file: it writes the objects in a drive's bindings, each in the unit named there. With a file
+(rule = "standard") the objects listed there get the given values instead, for any motor.
 """
 
 from __future__ import annotations
@@ -47,23 +47,22 @@ WINDOW_TIME = 0.002  # s
 RPM = 30.0 / math.pi  # of a rad/s
 
 # Stepper. Positions are microsteps, currents 1/255 of the largest.
-FULL, STEPS = 255, 32  # the largest current, and how many steps the driver makes of it
+FULL, STEPS = 255, 32  # the largest current, and the number of steps of the driver's current
 STANDBY = 0.5  # of the run current: half the holding torque
 MICROSTEPS = 8  # 2^8 of a full step
 REVOLUTIONS = 2.0  # rev/s of moves, within the flat part of any row's torque
 RAMP = 10.0  # rev/s^2
-STOP = 100.0  # rev/s^2: csp and csv want a quick stop that stops 6,000 rpm within a second
-BOW = 0.05  # s in which an S-shaped ramp (6086h = 1) has its acceleration
-# Blank time and off time of its chopper (TMC5160 class). In spread cycle a phase current ripples by no less than what
-# it rises by in the blank time, in which nothing is measured, and falls by in both slow decays of a cycle:
+STOP = 100.0  # rev/s^2: a quick stop in csp and csv must stop 6,000 rpm within a second
+BOW = 0.05  # s of an S-shaped ramp (6086h = 1) to its acceleration
+# Blank time and off time of its chopper (TMC5160 class). In spread cycle the ripple of a phase current is at least its
+# rise in the blank time, in which nothing is measured, plus its fall in both slow decays of a cycle:
 #
 #     ripple = (u t_blank + 2 R i t_off) / L
 #
-# The factory's blank time of 36 clocks and off time of 172 suit windings of some millihenries. For one on which this is
-# more than `MOST_RIPPLE` of the run current, the two that the data sheet of the chip has besides are taken: a blank
-# time of 24 clocks ("1 or 2 for most applications", TBL) and the off time 3 of its first example of a CHOPCONF
-# (000100C3h). The chopper's frequency grows, and with it the losses of switching, which is why it is not done for every
-# motor.
+# The factory's blank time of 36 clocks and off time of 172 suit windings of some millihenries. If the ripple is more
+# than `MOST_RIPPLE` of the run current, the other values in the chip's data sheet are used: a blank time of 24 clocks
+# ("1 or 2 for most applications", TBL) and the off time 3 of its first example of a CHOPCONF (000100C3h). The chopper's
+# frequency grows, and with it the losses of switching, which is why it is not done for every motor.
 MOST_RIPPLE = 0.05  # of the run current
 CLOCK = 16e6  # Hz
 FACTORY_BLANK, FACTORY_OFF = 36.0, 12.0 + 32.0 * 5.0  # clocks: 2092h = 2, 2097h = 5
@@ -104,7 +103,7 @@ def _servo(device: Device, motor: Motor) -> dict[str, float]:
 
     brushed = motor.kind == "dc"
     ramp = TORQUE * motor.rated_torque / (ROTORS * motor.inertia)  # rad/s^2
-    current = min(PEAK * motor.rated_current, device.nominal_current)  # as far as the stage carries it for ever
+    current = min(PEAK * motor.rated_current, device.nominal_current)  # at most the stage's continuous current
     gains = bandwidth_gains(device, motor, ROTORS * motor.inertia, **BANDWIDTHS)
     peak_ma = max(round(current * 10.0) * 100, 1)
     rated_ma = max(round(1e3 * motor.rated_current / math.sqrt(2.0)), 1)
@@ -135,7 +134,7 @@ def _stepper(device: Device, motor: Motor) -> dict[str, float]:
     """Return the quantities of a stepper's drive; speeds and ramps in microsteps."""
     full_steps = 4 * motor.n_p
     scale = full_steps * 2**MICROSTEPS
-    # The last of the settings that make a step of the current which is not above the rated one.
+    # The last current setting that is not above the rated current.
     share = min(motor.rated_current / device.current_full_scale, 1.0)
     step = max(math.floor(STEPS * share), 1)
     run = step * (FULL + 1) // STEPS - 1
@@ -147,7 +146,7 @@ def _stepper(device: Device, motor: Motor) -> dict[str, float]:
         "full_steps": full_steps,
         "run_current": run,
         "standby_current": round(STANDBY * run),
-        "blank_time": SHORT_BLANK if short else 0,  # 0: the factory's suits
+        "blank_time": SHORT_BLANK if short else 0,  # 0: keep the factory's
         "off_time": SHORT_OFF if short else 0,
         "encoder_counts": motor.encoder_counts,
         "speed": round(REVOLUTIONS * scale),
@@ -165,7 +164,7 @@ STANDARD = "standard"
 def corner_speed(motor: Motor, current: float, supply: float) -> float:
     """Return the electrical speed [rad/s] at which a current [A] across the flux takes the whole supply [V].
 
-    (R i + psi w)^2 + (L i w)^2 = u^2; the flux is that at the current. 0 where the resistance takes it all.
+    (R i + psi w)^2 + (L i w)^2 = u^2; the flux is that at the current. 0 if the resistance alone takes the supply.
     """
     psi = motor.psi_m / math.sqrt(1.0 + motor.saturation * current**2)
     a = psi**2 + (motor.L_q * current) ** 2
@@ -175,13 +174,13 @@ def corner_speed(motor: Motor, current: float, supply: float) -> float:
 
 
 def _rounded(value: float, digits: int = 2) -> float:
-    """Return a number of a few digits, as people choose it."""
+    """Return a number with a few digits, as people choose it."""
     unit = 10.0 ** (math.floor(math.log10(value)) + 1 - digits)
     return round(value / unit) * unit
 
 
 # --- any CiA 402 drive ------------------------------------------------------------------------------------------------
-# Fields whose value here is no limit at all, which an object with limits of its own may not be able to say.
+# Fields whose value here means no limit; an object with limits of its own may not allow it.
 NO_LIMIT = ("velocity_limit", "position_min", "position_max")
 SPEEDS = ("max_velocity", "homing_fast", "homing_slow")
 
@@ -191,8 +190,8 @@ def standard_preset(device: Device, motor: Motor, given: Mapping[str, int] | Non
 
     Args:
         device: The drive.
-        motor: What it is commissioned for.
-        given: Values that stand whatever the motor; None: nothing is given.
+        motor: The motor to commission it for.
+        given: Values that do not depend on the motor; None: no such values.
 
     Raises:
         ValueError: If a gain leaves the drive's range: the motor does not suit this drive.
@@ -221,12 +220,12 @@ def standard_preset(device: Device, motor: Motor, given: Mapping[str, int] | Non
 
 
 def beyond_limits(device: Device, motor: Motor, given: Mapping[str, int]) -> dict[Key, str]:
-    """Return the objects that cannot have what `standard_preset` would write, each with what they have instead."""
+    """Return the objects that cannot hold what `standard_preset` would write, with what they hold instead."""
     return {key: why for key, (_, why) in _of_motor(device, motor, given).items() if why and _text(key) not in given}
 
 
 def _of_motor(device: Device, motor: Motor, given: Mapping[str, int]) -> dict[Key, tuple[int, str]]:
-    """Return the raw values that follow from a motor, each with what its object's limits made of it, "" for nothing."""
+    """Return the raw values that follow from a motor, each with the effect of its object's limits ("" if none)."""
     dictionary = device.new_dictionary()
     context = Context(_increments(device, dictionary, given), device.current_full_scale / 32768.0, device.rated_current)
     ratios = {"velocity_ratio": velocity_ratio(device.roles), "set_point_ratio": set_point_ratio(device.roles)}
@@ -238,7 +237,7 @@ def _of_motor(device: Device, motor: Motor, given: Mapping[str, int]) -> dict[Ke
     values = _values(motor)
     found: dict[Key, tuple[int, str]] = {}
     fastest = math.inf
-    # First the limit of speed, which no speed passes.
+    # First the speed limit, since other speeds must not exceed it.
     for key, binding in sorted(device.bindings.items(), key=lambda row: row[1].field != "velocity_limit"):
         entry = dictionary.find(key)
         if binding.field not in values:
@@ -264,7 +263,7 @@ def _of_motor(device: Device, motor: Motor, given: Mapping[str, int]) -> dict[Ke
 
 
 def _widest(entry: Entry, field: str) -> int:
-    """Return the raw value of an object that comes next to no limit: its default, else the widest it can have."""
+    """Return an object's raw value closest to no limit: its default, otherwise its widest value."""
     assert entry.low is not None and entry.high is not None and isinstance(entry.default, int), "a number"
     sign = -1 if field == "position_min" else 1
     if sign * entry.default > 0 and entry.low <= entry.default <= entry.high:
@@ -273,7 +272,6 @@ def _widest(entry: Entry, field: str) -> int:
 
 
 def _values(motor: Motor) -> dict[str, float]:
-    """Return field of the record -> SI value."""
     brushed = motor.kind == "dc"
     ramp = TORQUE * motor.rated_torque / (ROTORS * motor.inertia)
     return {
@@ -319,7 +317,7 @@ def _values(motor: Motor) -> dict[str, float]:
 
 
 def _scale(device: Device, dictionary: ObjectDictionary, motor: Motor) -> dict[str, int]:
-    """Return the scale of positions in counts of the encoder; {} if the factory's values are valid."""
+    """Return the scale of positions in encoder counts; {} if the factory's values are valid."""
     scale = position_scale(device.roles)
     if scale is None:
         return {}

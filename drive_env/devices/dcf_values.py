@@ -1,4 +1,4 @@
-"""Values of a DCF (CiA 306): what one drive was commissioned with, beside the defaults of its EDS."""
+"""Values of a DCF (CiA 306): those that one drive was commissioned with, in addition to its EDS' defaults."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ COMMUNICATION = range(0x1000, 0x2000)
 
 
 def take_stored_values(eds: Path | EdsText, sections: Mapping[str, Section]) -> dict[Key, int]:
-    """Take the values of a DCF out of its sections; return those of what can be written and commands nothing.
+    """Remove the values of a DCF from its sections; return those of writable objects that are not commands.
 
-    A COB-ID that follows the node-ID of the DCF goes on following that of its node, and is left out.
+    A COB-ID that contains the DCF's node-ID is left out: it follows the actual node-ID.
 
     Args:
         eds: The file.
-        sections: Its sections, which keep no ParameterValue.
+        sections: Its sections, from which ParameterValue is removed.
     """
     texts = {
         (place[0], max(place[1], 0)): row.pop("ParameterValue")
@@ -48,7 +48,7 @@ def take_stored_values(eds: Path | EdsText, sections: Mapping[str, Section]) -> 
 
 
 def with_defaults(types: Mapping[Key, ODVariable], values: Mapping[Key, int]) -> dict[Key, ODVariable]:
-    """Return entries of which some have other defaults."""
+    """Return entries, some of them with other defaults."""
     changed = {key: copy.copy(types[key]) for key in values.keys() & types.keys()}
     for key, variable in changed.items():
         variable.default = values[key]

@@ -1,6 +1,6 @@
-"""Quirks of a drive's profile, where real ones differ from CiA 402: the table `quirks` of a device's data.
+"""Quirks: deviations of a drive's profile from CiA 402: the table `quirks` of a device's data.
 
-`defaults.toml` has every quirk as it is off, and what it is; a field of `DriveQuirks` is one that the record has.
+`defaults.toml` explains every quirk and has its value when off; the fields of `DriveQuirks` are those in the record.
 Speeds in rpm are a unit of `bindings`; inhibit time in ms, bit 30 of an RPDO, latencies and block transfer are rows of
 `canopen` (drive_env/devices/services.py).
 """
@@ -12,22 +12,22 @@ from typing import Any, NamedTuple
 
 from mechanics.reading.near_names import did_you_mean
 
-MAY_BE_ABSENT = (4, 7, 9, 10, 11, 13, 14, 15)  # the others are the state, or what a handshake waits for
-OF_OBJECTS = ("refuses_same_mode", "strict_transmission_types")  # what the record knows nothing of
+MAY_BE_ABSENT = (4, 7, 9, 10, 11, 13, 14, 15)  # the others are the state, or part of a handshake
+OF_OBJECTS = ("refuses_same_mode", "strict_transmission_types")  # not part of the record
 LONGEST_DELAY = 1.0  # s
 
 
 class DriveQuirks(NamedTuple):
-    """Where a drive's profile differs from the standard, as the record has it.
+    """Deviations of a drive's profile from the standard, as fields of the record.
 
     Attributes:
         mode_display_delay: From a write of 6060h until the mode changes [s].
-        mode_change_needs_halt: An enabled axis changes its mode only at rest, with halt set.
-        absent_status_bits: Mask of the bits of 6041h that never come.
-        set_point_buffer: Set-points that pp keeps besides the one under way, 0 or 1.
-        pv_slows_down_by_6084h: pv slows down with 6084h, not with 6083h.
-        pv_starts_and_stops: pv jumps to the start velocity, and from the end velocity.
-        homing_here_sets_zero: Homing methods 35 and 37 set the position to 0, whatever 607Ch is.
+        mode_change_needs_halt: Whether an enabled axis changes its mode only at rest, with halt set.
+        absent_status_bits: Mask of the bits of 6041h that are never set.
+        set_point_buffer: Set-points that pp keeps in addition to the one under way, 0 or 1.
+        pv_slows_down_by_6084h: Whether pv slows down with 6084h, not with 6083h.
+        pv_starts_and_stops: Whether pv jumps to the start velocity, and from the end velocity.
+        homing_here_sets_zero: Whether homing methods 35 and 37 set the position to 0 for any 607Ch.
     """
 
     mode_display_delay: float = 0.0
@@ -40,7 +40,7 @@ class DriveQuirks(NamedTuple):
 
 
 def drive_quirks_of(data: Mapping[str, Any]) -> DriveQuirks:
-    """Return the quirks of a device's data; ValueError for a key or a value that cannot be."""
+    """Return the quirks of a device's data; ValueError for an invalid key or value."""
     row = {name: value for name, value in data["quirks"].items() if name not in OF_OBJECTS}
     known = DriveQuirks._field_defaults
     for name, value in row.items():

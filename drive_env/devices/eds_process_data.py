@@ -1,4 +1,4 @@
-"""Process data of an EDS that a node could not start with: missing COB-IDs, mappings of missing objects or lengths."""
+"""Repairs an EDS' process data with which a node could not start: COB-IDs, mapped objects, lengths."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ LONGEST = 64  # bits
 
 
 def repair_process_data(sections: dict[str, Section], types: Mapping[Key, ODVariable]) -> Iterator[tuple[str, str]]:
-    """Give PDOs without a COB-ID that of the predefined set, or none; lengths are those of the mapped objects.
+    """Give PDOs without a COB-ID that of the predefined set, or 0; lengths become those of the mapped objects.
 
-    Nothing is mapped where a mapping cannot be.
+    An impossible mapping is emptied.
 
     Returns:
-        Where, and what was done.
+        The place, and the repair.
     """
     for index in [*RPDOS, *TPDOS]:
         cob_id = types.get((index, 1))

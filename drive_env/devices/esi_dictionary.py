@@ -1,7 +1,7 @@
 """The dictionary of an ESI (`Profile/Dictionary` of ETG.2000) as the sections of an EDS.
 
-Types are those that the file defines, down to the basic ones. What has no type here is left out and listed; the values
-of an EDS are looked at by its own reader.
+Types defined in the file are resolved to basic ones. Entries without a known type are left out and listed; the EDS
+reader checks the values.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _ARRAY_OF = re.compile(r"ARRAY\s*\[[^\]]*\]\s*OF\s+\w+$")
 TEXTS = {"STRING": datatypes.VISIBLE_STRING, "OCTET_STRING": datatypes.OCTET_STRING,
          "UNICODE_STRING": datatypes.UNICODE_STRING}  # fmt: skip
 FLOATS = {datatypes.REAL32: "<f", datatypes.REAL64: "<d"}
-DEEPEST_TYPE = 8  # types named by types
+DEEPEST_TYPE = 8  # nesting of types
 FIRST_OBJECT = 0x1000  # below are the numbers of data types
 FLAGS = {"": "ro", "ro": "ro", "rw": "rw", "wo": "wo"}
 
@@ -46,10 +46,10 @@ class _Member(NamedTuple):
 
 
 def dictionary_sections(dictionary: ET.Element) -> tuple[dict[str, Section], list[Repair]]:
-    """Return the objects of a dictionary as the sections of an EDS, and what was left out.
+    """Return the objects of a dictionary as the sections of an EDS, and the omitted entries.
 
     Raises:
-        ValueError: For a text in place of a number, a number beyond its range, or more entries than an EDS may have.
+        ValueError: For text in place of a number, a number beyond its range, or more entries than an EDS may have.
     """
     return _Dictionary(dictionary).sections()
 
@@ -109,7 +109,7 @@ class _Dictionary:
 
     # --- types ------------------------------------------------------------------------------------------------------
     def _basic(self, kind: str) -> int | None:
-        """Return the data type of CiA 301 that a type is; None for one with sub-indices, or one that is not known."""
+        """Return a type's data type of CiA 301; None if it has sub-indices or is unknown."""
         if kind not in self._basic_of:
             self._basic_of[kind] = self._look_up(kind)
         return self._basic_of[kind]
@@ -130,7 +130,7 @@ class _Dictionary:
         return None
 
     def _members(self, kind: str, what: str) -> Iterator[_Member]:
-        """Return the sub-indices of a type; none of a type that is not known."""
+        """Return the sub-indices of a type; empty if the type is unknown."""
         row = self._types.get(kind)
         seen: set[int] = set()
         for item in [] if row is None else row.findall("SubItem"):
@@ -143,7 +143,7 @@ class _Dictionary:
                 base = text_of(array, "BaseType")
                 found = [_Member(sub, f"{name} {sub}".strip(), base, flags) for sub in range(first, first + count)]
             elif item.find("SubIdx") is None:
-                continue  # bits between two sub-indices
+                continue  # unused bits between two sub-indices
             else:
                 sub = number(item.findtext("SubIdx"), f"{what}, {kind}/SubItem {name}/SubIdx", 0, U8)
                 found = [_Member(sub, name or f"Sub-index {sub}", of, flags)]
@@ -173,7 +173,7 @@ class _Dictionary:
         return row
 
     def _access(self, flags: ET.Element | None, where: str) -> tuple[str, str]:
-        """Return access and mapping as an EDS has them: `rww` is what outputs alone carry, `rwr` inputs alone."""
+        """Return access and mapping as in an EDS: `rww` for objects of outputs only, `rwr` of inputs only."""
         told = "" if flags is None else text_of(flags, "Access").lower()
         if told not in FLAGS:
             self._left_out.append(Repair(where, f"Access {told[:LONGEST_TEXT]!r} is read as ro"))
@@ -185,7 +185,7 @@ class _Dictionary:
 
 
 def _from_data(text: str, data_type: int) -> str:
-    """Return the value in bytes that are written in hexadecimal, lowest first; "" for what is no such text."""
+    """Return the value of bytes in hexadecimal, lowest first; "" for other text."""
     try:
         data = bytes.fromhex(text)
     except ValueError:

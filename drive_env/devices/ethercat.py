@@ -1,6 +1,6 @@
 """A device on EtherCAT: the table `ethercat` of its data. A device without it has no EtherCAT.
 
-Vendor, product and revision are those of its dictionary (1018h), and its process data those of 1C12h and 1C13h.
+Vendor, product and revision are in its dictionary (1018h), its process data in 1C12h and 1C13h.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from mechanics.reading.near_names import did_you_mean
 
-MEMORY = (0x1000, 0x3000)  # where a controller has memory for sync managers: 8 KiB
+MEMORY = (0x1000, 0x3000)  # a controller's memory for sync managers: 8 KiB
 LEAST_MAILBOX = 32  # bytes
 PLACES = ("receive", "send", "bootstrap_receive", "bootstrap_send")
 
@@ -24,18 +24,18 @@ class Place(NamedTuple):
 
 
 class ClockMode(NamedTuple):
-    """An operation mode of the clocks, as a configurator offers it: `Dc/OpMode` of ETG.2000; times in ns.
+    """An operation mode of the clocks in a configurator: `Dc/OpMode` of ETG.2000; times in ns.
 
     Attributes:
         name: Its name.
-        title: What a person reads.
+        title: Its title for people.
         activation: Value of 0980h: 0 without clocks, 0300h with SYNC0, 0700h with SYNC1, too.
-        cycle0: Cycle of SYNC0; 0: the factor's share of the master's cycle.
-        factor0: That share; 0: none is said.
-        shift0: By how much SYNC0 is late.
+        cycle0: Cycle of SYNC0; 0: `factor0` times the master's cycle.
+        factor0: That factor; 0: not given.
+        shift0: Delay of SYNC0.
         cycle1: Cycle of SYNC1.
-        factor1: Its share of SYNC0's cycle.
-        shift1: By how much SYNC1 is late.
+        factor1: Its ratio to SYNC0's cycle.
+        shift1: Delay of SYNC1.
     """
 
     name: str
@@ -50,7 +50,7 @@ class ClockMode(NamedTuple):
 
 
 class PdoRule(NamedTuple):
-    """Rules of a configurator for a mapping object: whether it must be assigned, and those that it excludes."""
+    """A configurator's rules for a mapping object: whether it must be assigned, and which others it excludes."""
 
     mandatory: bool = False
     exclude: tuple[int, ...] = ()
@@ -62,7 +62,7 @@ CLOCKS = (
 )
 SYNC1_ON = 0x0400  # of a mode's activation
 CONTROLS = (0x26, 0x22, 0x64, 0x20)  # of sync managers 0 to 3
-# What a CoE server may have, as ETG.2000 names it. PdoConfig is of devices whose mapping objects can be written.
+# Features of a CoE server in ETG.2000. PdoConfig is for devices with writable mapping objects.
 COE_ATTRIBUTES = ("SdoInfo", "PdoAssign", "PdoConfig", "PdoUpload", "CompleteAccess", "SegmentedSdo")
 COE = ("SdoInfo", "PdoAssign", "CompleteAccess", "SegmentedSdo")
 
@@ -71,23 +71,23 @@ class EtherCatBehaviour(NamedTuple):
     """Properties of a device on EtherCAT.
 
     Attributes:
-        receive: What the master writes: sync manager 0.
-        send: What it reads: sync manager 1.
-        bootstrap_receive: The same in Bootstrap; None: the device has no Bootstrap.
-        bootstrap_send: The same in Bootstrap; None as well.
+        receive: Mailbox that the master writes: sync manager 0.
+        send: Mailbox that it reads: sync manager 1.
+        bootstrap_receive: `receive` in Bootstrap; None: the device has no Bootstrap.
+        bootstrap_send: `send` in Bootstrap; None likewise.
         outputs: Address of sync manager 2.
         inputs: Address of sync manager 3.
-        only_on_can: Objects whose names begin so are not there on EtherCAT; "": all are.
-        described_as: Device whose EEPROM and description file it has; "": its own.
-        cycles: Cycles of SYNC0 that it takes [s]; empty: any from the shortest on.
-        can_indices: Ranges of indices, first and last, that are not there on EtherCAT either.
-        writable: Indices of objects that the EDS, which is CAN's, has read only, and that can be written on EtherCAT.
-        shortest_cycle: Of SYNC0 [s].
-        eeprom: Size [bytes].
-        order: Type as its maker writes it; "": the device's name.
+        only_on_can: Prefix of the names of objects that are absent on EtherCAT; "": all are present.
+        described_as: Device whose EEPROM and description file it uses; "": its own.
+        cycles: Cycles of SYNC0 that it accepts [s]; empty: any from the shortest on.
+        can_indices: Ranges of indices, first and last, that are absent on EtherCAT, too.
+        writable: Indices of objects that are read-only in the EDS, made for CAN, and writable on EtherCAT.
+        shortest_cycle: Shortest cycle of SYNC0 [s].
+        eeprom: Size of the EEPROM [bytes].
+        order: Order code; "": the device's name.
         controls: Control bytes of sync managers 0 to 3.
-        coe: What its ESI says of CoE, PdoConfig besides.
-        has_foe: Whether its ESI and SII say that it takes files.
+        coe: Features of CoE in its ESI, except PdoConfig.
+        has_foe: Whether its ESI and SII announce file transfer.
         clocks: Operation modes of its clocks.
         pdos: A configurator's rules for mapping objects; without a row, images that are not assigned together
             exclude each other.
@@ -115,17 +115,17 @@ class EtherCatBehaviour(NamedTuple):
 
     @property
     def uses_sync1(self) -> bool:
-        """Whether SYNC1 is what outputs take effect with, where the master makes it."""
+        """Whether outputs take effect with SYNC1 if the master switches it on."""
         return any(mode.activation & SYNC1_ON for mode in self.clocks)
 
     def has(self, index: int, name: str) -> bool:
-        """Return whether an object is there on EtherCAT."""
+        """Return whether an object is present on EtherCAT."""
         hidden = bool(self.only_on_can) and name.startswith(self.only_on_can)
         return not hidden and not any(first <= index <= last for first, last in self.can_indices)
 
 
 def ethercat_of(data: Mapping[str, Any] | None) -> EtherCatBehaviour | None:
-    """Return the table `ethercat` of a device's data; ValueError for a key or a value that cannot be."""
+    """Return the table `ethercat` of a device's data; ValueError for an invalid key or value."""
     if data is None:
         return None
     fields = EtherCatBehaviour._fields

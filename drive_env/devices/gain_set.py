@@ -1,4 +1,4 @@
-"""The gains of a device: which objects they are, in which loop and range; any number of them, in the device's order."""
+"""The gains of a device: their objects, loops and ranges, in any number, in the device's order."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 
 
 class Gain(NamedTuple):
-    """A gain: its name in code, its title for people, its object, the greatest integer, its loop and its part in it.
+    """A gain: its name in code, title for people, object, greatest integer, loop, and part of the loop.
 
-    lowest: The least integer that makes sense: of a loop's gain 1, since 0 opens it.
-    steps: How many different values the drive makes of all its integers; 0 for as many as there are.
-    is_time: Whether the integers of an I count the integration time, so that more of them act less.
+    lowest: The least sensible integer: 1 for a loop's gain, since 0 opens the loop.
+    steps: Number of different values that the drive makes of all integers; 0 if every integer is different.
+    is_time: Whether the integers of an I are an integration time, so that larger ones act less.
     """
 
     name: str
@@ -37,8 +37,8 @@ class Gain(NamedTuple):
     is_time: bool = False
 
 
-# Kinds of loops that a stepper's drive may close: the encoder commutates; or a PID moves the field besides the ramp, or
-# alone.
+# Kinds of loops that a stepper's drive may close: commutation by the encoder, or a PID that moves the field in addition
+# to the ramp, or alone.
 LOAD_ANGLE, PID_ON_RAMP, PID_ALONE = "load angle", "PID on the ramp", "PID alone"
 KINDS = (LOAD_ANGLE, PID_ON_RAMP, PID_ALONE)
 
@@ -46,9 +46,11 @@ KINDS = (LOAD_ANGLE, PID_ON_RAMP, PID_ALONE)
 class ClosedLoop(NamedTuple):
     """A loop that an open-loop stepper's drive may close.
 
-    kind: One of `KINDS`. mode: Its mode (`Role.LOOP_MODE`). gains: Names of what acts in it alone, P first, and of the
-    gains that these stand for: one object may be P of one loop and D of another. first: Values where a search begins,
-    by the first of these names; what is left out begins as commissioned.
+    kind: One of `KINDS`.
+    mode: Its mode (`Role.LOOP_MODE`).
+    gains: Names of the gains that act only in it, P first, with the gains whose objects they are: one object may be P
+        of one loop and D of another.
+    first: Start values of a search, by the first of these names; others start as commissioned.
     """
 
     kind: str
@@ -62,9 +64,9 @@ class ClosedLoop(NamedTuple):
         return self.kind != LOAD_ANGLE
 
 
-LOAD_DETECTION = ("load detection", "CoolStep")  # loops of settings by which a stepper's drive acts on its load reading
-FEED_FORWARD = ("feed-forward", "speed")  # loop and part of the share of the demanded speed that a position loop adds
-# Steps of a setting, of which 0 is a value as others are, that a search takes for a factor of e.
+LOAD_DETECTION = ("load detection", "CoolStep")  # loops by which a stepper's drive reacts to its load reading
+FEED_FORWARD = ("feed-forward", "speed")  # loop and part: the share of the demanded speed that a position loop adds
+# Steps of a setting for which 0 is an ordinary value; a search counts one as a factor of e.
 PER_UNIT = {"load detection": 12.0, "CoolStep": 2.5, FEED_FORWARD[0]: 300.0}
 RUN, STANDBY = ("current", "amplitude"), ("current", "standby amplitude")  # of a stepper's phases: loop and part
 
@@ -73,9 +75,8 @@ RUN, STANDBY = ("current", "amplitude"), ("current", "standby amplitude")  # of 
 class GainSet:
     """The gains of a device, in its order; raw integers have shape (..., count).
 
-    cascade: Structure of the loops that they are gains of, one of those of `drive_env/devices/gains.py`, from which
-    their rule comes; "" for loops that nothing is known of.
-    closed_loops: What a stepper's drive may close.
+    cascade: Structure of their loops, one of those in `drive_env/devices/gains.py`, which have a rule; "" if unknown.
+    closed_loops: The loops that a stepper's drive may close.
     """
 
     rows: tuple[Gain, ...]
@@ -99,40 +100,40 @@ class GainSet:
 
     @property
     def count(self) -> int:
-        """How many there are."""
+        """Number of gains."""
         return len(self.rows)
 
     def column(self, loop: str, part: str) -> int | None:
-        """Return which gain is the part ("P", "I") of a loop ("current", "velocity", "position"); None for none."""
+        """Return the column of a part ("P", "I") of a loop ("current", "velocity", "position"); None if it has none."""
         return next((k for k, row in enumerate(self.rows) if (row.loop, row.part) == (loop, part)), None)
 
     def columns_of(self, *loops: str) -> list[int]:
-        """Return which gains belong to loops."""
+        """Return the columns of the gains of loops."""
         return [k for k, row in enumerate(self.rows) if row.loop in loops]
 
     @property
     def outer(self) -> tuple[str, ...]:
-        """Names of those that machines differ in: of the velocity and the position loop; in open loop the currents."""
+        """Names of the gains that depend on the machine: of velocity and position loop; in open loop the currents."""
         if self.is_open_loop:
             return tuple(row.name for row in self.rows if (row.loop, row.part) in (RUN, STANDBY))
         return tuple(self.names[k] for k in self.columns_of("velocity", "position"))
 
     @property
     def is_open_loop(self) -> bool:
-        """Whether the motor follows the current's amplitude and no loop is closed around it: a stepper's."""
+        """Whether no loop is closed and the motor follows the current's amplitude, as on a stepper."""
         return self.column(*RUN) is not None and not self.columns_of("velocity", "position")
 
     @property
     def searched(self) -> tuple[str, ...]:
-        """Names by which gains can be asked for: their own, and those that they have in loops that may be closed."""
+        """Names by which gains can be selected: their own, and those in loops that may be closed."""
         return tuple(dict.fromkeys([*self.names, *(name for loop in self.closed_loops for name in loop.gains)]))
 
     def loop_of_kind(self, kind: str) -> ClosedLoop | None:
-        """Return the loop of a kind; None for none."""
+        """Return the loop of a kind, or None."""
         return next((loop for loop in self.closed_loops if loop.kind == kind), None)
 
     def loop_of(self, names: Sequence[str]) -> ClosedLoop | None:
-        """Return the loop in which gains of these names act alone; None where they act in open loop.
+        """Return the loop in which gains of these names act alone; None if they act in open loop.
 
         Raises:
             ValueError: For names of several loops.
@@ -146,12 +147,12 @@ class GainSet:
         return loops[0] if loops else None
 
     def columns_of_loop(self, loop: ClosedLoop) -> list[int]:
-        """Return which gains act in a loop that a drive may close."""
+        """Return the columns of the gains that act in a loop that a drive may close."""
         return [self.names.index(name) for name in loop.gains.values()]
 
     @property
     def powers(self) -> Floats:
-        """1 where a gain acts in proportion to its integer, -1 where by its inverse, shape (count,)."""
+        """1 if a gain acts in proportion to its integer, -1 if in inverse proportion, shape (count,)."""
         return np.array([-1.0 if row.is_time else 1.0 for row in self.rows])
 
     @property
@@ -165,10 +166,10 @@ class GainSet:
         return np.array([row.highest for row in self.rows], np.int64)
 
     def columns(self, names: Sequence[str]) -> Integers:
-        """Return which gains have names.
+        """Return the columns of gains by name.
 
         Raises:
-            ValueError: For a name that none has, naming those there are, and unless they are different ones.
+            ValueError: For an unknown name, listing the known ones, or for a name given twice.
         """
         own = {name: name for name in self.names} | {k: v for loop in self.closed_loops for k, v in loop.gains.items()}
         for name in names:
@@ -179,7 +180,7 @@ class GainSet:
         return np.array([self.names.index(own[name]) for name in names])
 
     def clipped(self, raw: ArrayLike) -> Integers:
-        """Return gains as integers within the device's ranges; those of a loop are 1 at least: 0 opens it."""
+        """Return gains as integers within the device's ranges; a loop's gains are at least 1, since 0 opens it."""
         return np.asarray(np.clip(np.rint(np.asarray(raw, float)), self.lowest, self.highest), np.int64)
 
     def with_velocity_p(self, raw: Integers, factor: ArrayLike) -> Integers:
@@ -198,7 +199,7 @@ class GainSet:
         return changed
 
     def softened(self, raw: Integers, divisor: Integers | int, *loops: str) -> Integers:
-        """Return gains of shape (n, count) with those of loops over a whole number, shape (n,) or one; 1 at least."""
+        """Return gains of shape (n, count), those of loops divided by a whole number, shape (n,) or one; at least 1."""
         softer = raw.copy()
         for column in self.columns_of(*loops):
             row, now = self.rows[column], raw[:, column]
@@ -209,11 +210,11 @@ class GainSet:
         """Return gains of shape (..., count) with some changed, within their ranges; see `change`.
 
         Args:
-            raw: What is changed.
-            by: How much, of shape (..., len(columns)): the logarithm of a factor by which a gain acts more; of settings
-                of which 0 is a value as others are, in units of `PER_UNIT`.
-            columns: Which gains.
-            highest: Of all gains.
+            raw: The gains.
+            by: The change, shape (..., len(columns)): the logarithm of the factor by which a gain acts more; in units
+                of `PER_UNIT` for settings of which 0 is an ordinary value.
+            columns: The gains to change.
+            highest: Greatest integers of all gains.
         """
         unit, result = self._per_unit(columns), raw.copy()
         by = np.asarray(by, float)
@@ -225,7 +226,7 @@ class GainSet:
         return result
 
     def change(self, raw: Integers, since: Integers, columns: Sequence[int] | Integers) -> Floats:
-        """Return how far some gains are from others, (..., len(columns)), as `changed` takes it."""
+        """Return the change of some gains since others, (..., len(columns)), in the units of `changed`."""
         unit = self._per_unit(columns)
         now, before = raw[..., columns], since[..., columns]
         if not unit.any():
@@ -237,12 +238,12 @@ class GainSet:
         return np.array([PER_UNIT.get(self.rows[k].loop, 0.0) for k in columns])
 
     def scaled(self, raw: Integers, factor: ArrayLike, columns: Sequence[int]) -> Integers:
-        """Return gains of shape (..., count), some of which act by a factor more, within their ranges; 1 at least.
+        """Return gains of shape (..., count), some of them with a factor more effect, within their ranges; at least 1.
 
         Args:
-            raw: What is changed.
+            raw: The gains.
             factor: One, or an array that fits (..., len(columns)).
-            columns: Which gains.
+            columns: The gains to change.
         """
         shape = np.broadcast_shapes((*raw.shape[:-1], len(columns)), np.shape(factor))
         result = np.broadcast_to(raw, (*shape[:-1], self.count)).copy()
@@ -251,18 +252,18 @@ class GainSet:
         return result
 
     def strength(self, raw: Integers, columns: Sequence[int]) -> Floats:
-        """Return by how much some gains act, up to a constant of each, (..., len(columns))."""
+        """Return the effect of some gains, up to a constant factor of each, (..., len(columns))."""
         return np.asarray(raw[..., columns].astype(float) ** self.powers[columns])
 
     def without_feed_forward(self, raw: Integers) -> Integers:
-        """Return gains of shape (..., count) whose feed-forward, if there is one, is 0."""
+        """Return gains of shape (..., count) with 0 as feed-forward, if there is one."""
         columns = self.columns_of(FEED_FORWARD[0])
         result = raw.copy()
         result[..., columns] = 0
         return result
 
     def opens(self, raw: Sequence[int] | Integers, *loops: str) -> bool:
-        """Return whether gains of shape (count,) leave one of the loops open: its P is 0."""
+        """Return whether gains of shape (count,) open one of the loops: its P is 0."""
         return any(raw[k] == 0 for k in self.columns_of(*loops) if self.rows[k].part == "P")
 
     def read(self, drives: AxisObjects) -> Integers:

@@ -7,8 +7,8 @@ the integration time and k_v the position gain [1/s], the raw integers are
     P_P = 3.75 k_v
 
 for a current loop of full scale 100 A; the functions take the scale from the device's data. A device names the cascade
-in its `gains.toml` (`cascade = "pi"`); it may have some of these gains only, the others fixed, and count them in other
-units than the chip, which its bindings name.
+in its `gains.toml` (`cascade = "pi"`); it may have only some of these gains, with the others fixed, and count them in
+other units than the chip, named in its bindings.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ Part = tuple[str, str]  # of a cascade: loop, and "P" or "I"
 
 
 class SiGains(NamedTuple):
-    """Raw gains in SI units; nan for one that a drive does not have.
+    """Raw gains in SI units; nan for a gain that the drive lacks.
 
     torque_p [V/A], torque_integration [s], velocity_p [A s/rad], velocity_integration [s], position_p [1/s].
     """
@@ -48,7 +48,7 @@ class SiGains(NamedTuple):
 
 
 def gains_in_si(device: Device, supply: float, gains: RawGains) -> SiGains:
-    """Return gains of a device's set as gains [SI] with a supply voltage [V]; an integrator that is off takes for ever.
+    """Return gains of a device's set as gains [SI] with a supply voltage [V]; an integrator that is off has time inf.
 
     Raises:
         ValueError: If the device names no cascade.
@@ -106,7 +106,7 @@ def bandwidth_gains(
 
 # --- the baseline rule ------------------------------------------------------------------------------------------------
 class Rule(NamedTuple):
-    """A rule that computes gains from the total inertia, as identified, and the motor's data sheet.
+    """A rule that computes gains from the identified total inertia and the motor's data sheet.
 
     With T the sum of the small time constants:
 
@@ -126,8 +126,8 @@ class Rule(NamedTuple):
 # as shipped, 48 degrees and 10 dB with the slowest, 150 Hz, of which no drive tells; their variants keep theirs, too.
 # With the filter as shipped alone 0.48, 3 and 0.6 would do: J is half, and a trial is stopped by the ripple that an
 # encoder of 4096 counts makes, from a speed of 0.3 on. A current loop by its own lags (1100...1400 Hz) is no better.
-# What the rule cannot know: few counts of an encoder make the current swing at rest (qube_servo_3, 2048), and a spring
-# near the velocity loop makes it oscillate.
+# The rule cannot know two effects: few counts of an encoder make the current swing at rest (qube_servo_3, 2048), and a
+# spring near the velocity loop makes it oscillate.
 BASELINE_RULE = Rule(current_hz=1000.0, speed=0.25, integration=4.0, position=0.6)
 
 
@@ -138,10 +138,10 @@ def rule_gains(
 
     Args:
         device: The drive.
-        motor: The motor, as its data sheet has it.
-        inertia: Total inertia, rotor and load [kg*m^2], shape (n,). What a drive measures is inertia over torque
-            constant: multiplied by the data sheet's torque constant, it gives the right gains for a motor whose own
-            constant is another.
+        motor: The motor, by its data sheet.
+        inertia: Total inertia, rotor and load [kg*m^2], shape (n,). A drive measures inertia over torque constant;
+            multiplied by the data sheet's torque constant, it gives the right gains even if the motor's actual constant
+            differs.
         rule: The rule's constants.
         supply: Supply voltage [V]; the motor's own by default.
 
@@ -167,15 +167,15 @@ def rule_gains(
 def small_time_constants(device: Device, velocity_filter: ArrayLike, current_hz: float = 1000.0) -> Floats:
     """Return the sum of the small time constants of the velocity loop [s].
 
-    The current loop as a lag, one and a half PWM periods until the voltage acts, the velocity filter's delay, and one
-    period of the velocity loop: half for the difference of counts, half for holding its output.
+    They are the lag of the current loop, one and a half PWM periods until the voltage acts, the velocity filter's
+    delay, and one period of the velocity loop: half for the difference of counts, half for holding its output.
 
     Args:
         device: The drive.
         velocity_filter: Corner frequency of the velocity filter [Hz].
         current_hz: Bandwidth of the current loop [Hz].
     """
-    from drive_env.devices.gains import VELOCITY_FILTER_DAMPING  # the compiler comes with it
+    from drive_env.devices.gains import VELOCITY_FILTER_DAMPING  # imports the compiler
 
     filters = 2.0 * VELOCITY_FILTER_DAMPING / (2.0 * math.pi * np.asarray(velocity_filter, float))
     return np.asarray(1.0 / (2.0 * math.pi * current_hz) + 1.5 / device.current_rate + filters
@@ -183,8 +183,8 @@ def small_time_constants(device: Device, velocity_filter: ArrayLike, current_hz:
 
 
 # --- other devices' gains ---------------------------------------------------------------------------------------------
-PI = "pi"  # the cascade, as a device names it
-# The chip's gains in their order, torque, velocity, position: loop and part, and the unit that it counts them in.
+PI = "pi"  # the cascade's name in a device's data
+# The chip's gains in their order, torque, velocity, position: loop and part, and their unit.
 _CHIP = {
     ("current", "P"): "current P",
     ("current", "I"): "I",
@@ -209,7 +209,7 @@ def has_linear_model(device: Device) -> bool:
 
 
 def _lacks(device: Device) -> str:
-    """Return the parts that a device lacks for the linear model, "" for none."""
+    """Return the parts that a device lacks for the linear model; "" if it lacks none."""
     if device.gains.cascade != PI:
         return "its gains.toml names no cascade"
     own = [(row.loop, row.part) for row in device.gains.rows if (row.loop, row.part) != FEED_FORWARD]
@@ -220,7 +220,7 @@ def _lacks(device: Device) -> str:
 
 
 def cascade_columns(device: Device) -> list[int]:
-    """Return where in a device's gain set those of the cascade are: P, I of current, P, I of velocity, P of position.
+    """Return the columns of the cascade in a device's gain set: P, I of current, P, I of velocity, P of position.
 
     Raises:
         ValueError: If the drive has no linear model of its loops.
@@ -231,13 +231,13 @@ def cascade_columns(device: Device) -> list[int]:
 
 
 class GainScale(NamedTuple):
-    """Integers of a gain, and what they are in another unit: raw = per * value^power. 0 stays 0, and is off."""
+    """Converts a gain's integers to another unit: raw = per * value^power. 0 stays 0, and means off."""
 
     per: float
-    power: float  # 1, or -1 where the integers count a time
+    power: float  # 1, or -1 if the integers count a time
 
     def raw(self, value: ArrayLike) -> Floats:
-        """Return integers, not rounded, of values."""
+        """Return the integers of values, not rounded."""
         return self._along(self.per, value)
 
     def value(self, raw: ArrayLike) -> Floats:
@@ -254,7 +254,7 @@ class GainScale(NamedTuple):
 
 
 def loop_scales(device: Device) -> list[GainScale]:
-    """Return the scale of each gain to what the loops take: duty/A, A s/rad, 1/s; of an I a share of P e per sample."""
+    """Return the scale of each gain to the loops' units: duty/A, A s/rad, 1/s; for an I the share of P e per sample."""
     context, found = _context(device), []
     rates = {"current": device.current_rate, "velocity": device.velocity_rate}
     for row in device.gains.rows:
@@ -264,12 +264,12 @@ def loop_scales(device: Device) -> list[GainScale]:
 
 
 def per_chip(device: Device) -> dict[Part, GainScale]:
-    """Return the scale of a device's integers to the chip's, by loop and part; exactly 1 where it counts alike.
+    """Return the scale of a device's integers to the chip's, by loop and part; exactly 1 for equal units.
 
-    The chip has no feed-forward: it is left out.
+    Feed-forward, which the chip does not have, is left out.
 
     Raises:
-        ValueError: If the device names no cascade, or has a gain which that does not have, or has once.
+        ValueError: If the device names no cascade, or has a gain that the cascade lacks, or a gain twice.
     """
     known = device.gains
     if known.cascade != PI:
@@ -298,7 +298,7 @@ def per_chip(device: Device) -> dict[Part, GainScale]:
 
 
 def as_chip(device: Device, gains: RawGains) -> list[float]:
-    """Return gains of a device's set as the chip counts them, in the order of `Gains`; nan for one that it lacks.
+    """Return gains of a device's set in the chip's units, in the order of `Gains`; nan for one that the device lacks.
 
     Raises:
         ValueError: If the device names no cascade.
@@ -309,9 +309,9 @@ def as_chip(device: Device, gains: RawGains) -> list[float]:
 
 
 def si_scales(device: Device, supply: float) -> dict[Part, GainScale]:
-    """Return the scale of a device's integers to SI, by loop and part: of an I to 1/T_i [1/s].
+    """Return the scale of a device's integers to SI, by loop and part; for an I to 1/T_i [1/s].
 
-    P of current [V/A], of velocity [A s/rad], of position [1/s]; the supply [V] is that of the drive.
+    P of current [V/A], of velocity [A s/rad], of position [1/s]; the supply [V] is the drive's.
 
     Raises:
         ValueError: If the device names no cascade.
@@ -327,7 +327,7 @@ def si_scales(device: Device, supply: float) -> dict[Part, GainScale]:
 
 
 def _of_device(device: Device, raw: Floats) -> Floats:
-    """Return raw gains of the chip, shape (..., 5), as those of a device, (..., count), in its units.
+    """Convert raw gains of the chip, shape (..., 5), to a device's units, (..., count).
 
     A feed-forward, which the chip does not have, is 0.
     """

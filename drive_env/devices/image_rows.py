@@ -1,4 +1,4 @@
-"""Process images that a device has ready-made, as packed structures: `images.toml` has the object of each field."""
+"""A device's ready-made process images, as packed structures: `images.toml` names the object of each field."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import NamedTuple
 from drive_env.cia402 import Key
 from mechanics.reading.untrusted import read_toml
 
-# Data types of fields: character of `struct` for the bits as they are, and how many.
+# Data types of fields: `struct` character for the raw bits, and their number.
 TYPES = {"u8": ("B", 8), "u16": ("H", 16), "i16": ("H", 16), "u32": ("I", 32), "i32": ("I", 32), "i64": ("Q", 64)}
 NAMES_ANOTHER = "@"
 
@@ -21,7 +21,7 @@ class ImageField(NamedTuple):
         type: Its data type.
         key: Its object; None for a reserved field.
         is_name: Whether it names the object that the image carries.
-        taken_while: An object, and its values with which the field is taken; None: it always is.
+        taken_while: An object, and the values with which the field is applied; None: always.
     """
 
     type: str
@@ -31,7 +31,7 @@ class ImageField(NamedTuple):
 
 
 class FixedImage(NamedTuple):
-    """An image: whether it goes into the drive, and its fields in the order of the bytes."""
+    """An image: whether it is sent to the drive, and its fields in byte order."""
 
     is_output: bool
     fields: tuple[ImageField, ...]

@@ -1,8 +1,8 @@
 """A device's folder from a vendor's EDS or ESI: dictionary, bindings, roles, gains, class values, open questions.
 
-Everything that the file says is taken; what it does not say and the emulator needs is a class value or an object of the
-emulator's own, in the manufacturer's area where the EDS has none; each is in the list. An object of the EDS that has no
-effect here stays an entry that can be read and written, and is listed as such.
+All data of the file are used. Data that it lacks and the emulator needs become class values, or objects of the
+emulator's own in a free part of the manufacturer's area; each is listed. An object of the EDS without effect here can
+still be read and written, and is listed, too.
 """
 
 from __future__ import annotations
@@ -57,18 +57,18 @@ TEMPLATE = Path(__file__).parent / "template.toml"
 CLASS_VALUES = "no EDS has them: class values of a 24 to 48 V stage"
 AS_THE_STANDARD = "no EDS has them: the standard's way; `quirks` and `canopen` of the file formats name what may differ"
 LIST_NAME, EDS_NAME = "to_fill_in.md", "drive.eds"
-# Where the emulator's own objects may lie: the first block of the manufacturer's area that the EDS leaves free.
+# Place of the emulator's own objects: the first block of the manufacturer's area that the EDS leaves free.
 OWN_BLOCKS = range(0x5F00, 0x1FFF, -0x100)
 OWN_PER_AXIS = 0x10
 OWN_TITLES = ("Emulator: gains", "Emulator: motor", "Emulator: what the EDS lacks")
 STORE, RESTORE = 0x1010, 0x1011
 SYNC_ID = 0x1005
 CONSUMER_HEARTBEAT, GUARD_TIME, ERROR_BEHAVIOUR = 0x1016, 0x100C, 0x1029
-STORE_ALL, STORE_COMMUNICATION, STORE_PROFILE = 1, 2, 3  # sub-indices of 1010h (CiA 301); those above are the maker's
+STORE_ALL, STORE_COMMUNICATION, STORE_PROFILE = 1, 2, 3  # sub-indices of 1010h (CiA 301); higher ones are the maker's
 TRANSMISSION_TYPES = ["0...240", 254, 255]
 
 
-# What a drive has that has a mode, where its 6502h tells none.
+# Object that shows a mode is supported, for a drive without 6502h.
 MODE_NEEDS = {
     cia402.PP: cia402.TARGET_POSITION,
     cia402.VL: cia402.VL_TARGET_VELOCITY,
@@ -79,7 +79,7 @@ MODE_NEEDS = {
     cia402.CST: cia402.TARGET_TORQUE,
 }
 
-# What a mode follows; homing has an object of the emulator's own where the drive has none.
+# Object that a mode follows; homing uses one of the emulator's own if the drive has none.
 MODE_TARGETS = {
     cia402.PP: (cia402.TARGET_POSITION, 0),
     cia402.VL: (cia402.VL_TARGET_VELOCITY, 0),
@@ -92,7 +92,7 @@ MODE_TARGETS = {
 }
 
 
-# Limits: where the default lies outside an object's own limits it becomes the widest of these, of others the nearest.
+# Limits: a default outside an object's own limits becomes the widest of these; for other objects the nearest.
 WIDEST = {(index, 0): "max" for index in (cia402.FOLLOWING_WINDOW, cia402.MAX_TORQUE, cia402.MAX_CURRENT,
           cia402.MAX_PROFILE_VELOCITY, cia402.MAX_MOTOR_SPEED)}  # fmt: skip
 WIDEST |= {(cia402.POSITION_LIMITS, 1): "min", (cia402.POSITION_LIMITS, 2): "max"}
@@ -106,14 +106,14 @@ class Note(NamedTuple):
 
 
 class NewDevice(NamedTuple):
-    """A folder that was written.
+    """The written folder.
 
     Attributes:
         folder: The folder.
-        fill_in: What a person must fill in or check.
+        fill_in: Values that a person must fill in or check.
         modes: The drive's modes of operation, and their support here.
         without_effect: Objects that are stored and have no effect here.
-        repairs: What was put right in the EDS.
+        repairs: Repairs of the EDS.
     """
 
     folder: Path
@@ -151,21 +151,21 @@ def new_device(
     product: str = "",
     on_ethercat: bool = False,
 ) -> NewDevice:
-    """Write the folder of a device that its EDS or ESI describes; return the notes that a person must read.
+    """Write the folder of a device that its EDS or ESI describes; return it with the notes for a person.
 
     Args:
-        eds: The vendor's EDS; None where its ESI has the dictionary.
-        folder: To be made.
-        motor: Whose rated current is the base of thousandths.
-        velocity_unit: Unit of speeds, "rpm", "pps", "0.1 rpm" ..., where the file tells none.
-        acceleration_unit: The same of accelerations.
+        eds: The vendor's EDS; None if its ESI has the dictionary.
+        folder: The folder to create.
+        motor: Motor to whose rated current thousandths refer.
+        velocity_unit: Unit of speeds, "rpm", "pps", "0.1 rpm" ..., if the file names none.
+        acceleration_unit: Unit of accelerations, likewise.
         esi: The vendor's ESI, for a device on EtherCAT with its images and identity; None without one.
-        product: Which device of an ESI with several.
-        on_ethercat: Make a device on EtherCAT of an EDS alone.
+        product: Name of the device in an ESI with several.
+        on_ethercat: Whether to make a device on EtherCAT from an EDS alone.
 
     Raises:
-        ValueError: For a file that describes no CiA 402 drive, a folder that exists, or an unknown unit.
-        RuntimeError: For a drive that could be moved in no mode.
+        ValueError: For a file that does not describe a CiA 402 drive, a folder that exists, or an unknown unit.
+        RuntimeError: For a drive that could not be moved in any mode.
     """
     if folder.exists():
         raise ValueError(f"{folder} exists already, and is not overwritten; choose another folder with --out")
@@ -188,19 +188,19 @@ def new_device(
     try:
         with files_to_be({folder / name: text for name, text in draft.files(folder).items()}):
             pass
-        device = find_device.__wrapped__(str(folder))  # not kept: a person goes on to edit these files
+        device = find_device.__wrapped__(str(folder))  # not cached: a person will edit these files
         limited = beyond_limits(device, motor, draft.stored_values())
         notes = tuple(Note(f"{_text(key)} of drive.eds", why) for key, why in limited.items())
         made = made._replace(fill_in=(*notes, *made.fill_in))
         write_whole(folder / LIST_NAME, made.text())
     except BaseException:
-        rmtree(folder, ignore_errors=True)  # it would be refused the next time
+        rmtree(folder, ignore_errors=True)  # an existing folder would be refused the next time
         raise
     return made
 
 
 class _Draft:
-    """The device of one EDS in the making; `part` is what EtherCAT makes of it, None on CAN."""
+    """The device of one EDS in progress; `part` is its part for EtherCAT, None on CAN."""
 
     def __init__(
         self,
@@ -215,7 +215,7 @@ class _Draft:
         self._file: EdsFile = eds_file(eds)
         try:
             self._types: Types = read_types(eds)
-        except Exception as error:  # the reader raises whatever the broken line leads to
+        except Exception as error:  # the reader raises any exception for a broken line
             raise ValueError(f"{eds} cannot be read as an EDS: {error}") from error
         self._axes = axes_of(eds, self._types)
         for index in (cia402.CONTROLWORD, cia402.MODE):
@@ -277,12 +277,12 @@ class _Draft:
         }
 
     def stored_values(self) -> dict[str, int]:
-        """Return the values of a DCF by the names that a folder's files have for objects."""
+        """Return the values of a DCF by the objects' names in a folder's files."""
         return {_text(key): raw for key, raw in self._stored.items()}
 
     # --- what the file says of one drive ------------------------------------------------------------------------------
     def _leave_out_own_objects(self) -> None:
-        """Leave out the emulator's own objects of a file that a folder was exported as: they are made anew."""
+        """Remove the emulator's own objects from the file of an exported folder: they are made anew."""
         own = {
             place[0]
             for name, row in self._sections.items()
@@ -295,7 +295,7 @@ class _Draft:
             del self._sections[name]
 
     def _drop_wrong_process_data(self) -> None:
-        """Leave the PDOs of a DCF whose values cannot be as the file's defaults have them."""
+        """Restore the defaults of PDOs whose values in a DCF are impossible."""
         told = list(repair_process_data(copy.deepcopy(self._sections), with_defaults(self._types, self._stored)))
         known = {note.what for note in self._changes}
         for where, why in told:
@@ -306,7 +306,7 @@ class _Draft:
                 self._changes.append(Note(where, f"the DCF's values are not taken: {why}"))
 
     def _check_stored_values(self) -> None:
-        """Leave out values of a DCF that their objects cannot have here."""
+        """Remove values of a DCF that their objects cannot hold here."""
         allowed = {(cia402.HOMING_METHOD, 0): {0, *self._homing_methods()}, (cia402.QUICK_STOP_OPTION, 0):
                    set(QUICK_STOP_OPTIONS)}  # fmt: skip
         for key, raw in list(self._stored.items()):
@@ -328,8 +328,8 @@ class _Draft:
         return found.default if found is not None and isinstance(found.default, int) else 0
 
     def _supported_modes(self) -> list[int]:
-        """Return the numbers of the modes that drive and emulator both have."""
-        from drive_env.firmware.common.modes import MODES  # the compiler comes with it
+        """Return the numbers of the modes that both drive and emulator support."""
+        from drive_env.firmware.common.modes import MODES  # imports the compiler
 
         bits = self._default(cia402.SUPPORTED_MODES)
         here = [mode for mode in MODES if mode.supported_bit is not None]
@@ -376,7 +376,7 @@ class _Draft:
         return numbers
 
     def _is_within_6060h(self, mode: Mode) -> bool:
-        """Return whether the limits of 6060h have a mode; tell of one that they leave out."""
+        """Return whether the limits of 6060h include a mode; note one that they exclude."""
         variable = self._types[cia402.MODE, 0]
         low = -128 if variable.min is None else variable.min
         high = 127 if variable.max is None else variable.max
@@ -387,7 +387,7 @@ class _Draft:
         return False
 
     def _has_target(self, mode: Mode) -> bool:
-        """Return whether the drive has the object that a mode of 6502h follows; tell of one that has not."""
+        """Return whether the drive has the object that a mode of 6502h follows; note a mode without it."""
         key = MODE_TARGETS.get(mode.number)
         variable = None if key is None else self._types.get(key)
         if key is not None and (variable is None or variable.data_type not in INTEGER_TYPES):
@@ -400,7 +400,7 @@ class _Draft:
         return True
 
     def _homing_methods(self) -> list[int]:
-        """Return the methods of homing that both have: within 6098h's limits, and in 60E3h where that lists any."""
+        """Return the homing methods that both support: within 6098h's limits, and in 60E3h if that lists any."""
         variable = self._types.get((cia402.HOMING_METHOD, 0))
         low = -128 if variable is None or variable.min is None else variable.min
         high = 127 if variable is None or variable.max is None else variable.max
@@ -437,7 +437,7 @@ class _Draft:
         return {role.name.lower(): key for role, key in VL_FACTORS.items() if key in self._types}
 
     def _take_current_limit(self) -> None:
-        """Let 6072h limit the current of a drive without 6073h: by its rated torque it is the same."""
+        """Bind 6072h as the current limit of a drive without 6073h: by its rated torque it is equivalent."""
         limit, torque = (cia402.MAX_CURRENT, 0), (cia402.MAX_TORQUE, 0)
         if limit not in self._bindings and torque in self._types:
             self._bindings[torque] = Binding(*torque, "i_max", self._unit(TORQUE))
@@ -504,7 +504,7 @@ class _Draft:
             self._sections[object_section(index, sub)] = section | {"DefaultValue": str(default)} | shown
 
     def _correct_defaults(self) -> None:
-        """Give objects another factory value where the emulator cannot have theirs, and units to bound objects."""
+        """Correct factory values that the emulator cannot have, and add units to bound objects."""
         for key, binding in self._bindings.items():
             row = self._section(key)
             if binding.unit != "raw" and not row.get("Unit"):
@@ -530,7 +530,7 @@ class _Draft:
                 self._changes.append(Note(f"[{_text(key)}]", "the emulator keeps 63 bits: its default is 0"))
 
     def _correct_defaults_beyond_limits(self) -> None:
-        """Let the factory value of an object, 0 where the file has none, be one that its own limits allow."""
+        """Correct the factory value of an object (0 if the file has none) to one that its own limits allow."""
         for key, variable in self._types.items():
             if key[0] in COMMUNICATION or variable.data_type not in INTEGER_TYPES or key in self._units.scale.values():
                 continue
@@ -547,7 +547,7 @@ class _Draft:
             self._changes.append(Note(f"[{_text(key)}]", f"default {was} lies outside {low} to {high}: {value}"))
 
     def _correct_scale(self) -> None:
-        """Let the objects that make the scale of positions never be 0, by which others are divided."""
+        """Prevent 0 in objects of the position scale, which divide."""
         keys = list(self._units.scale.values())
         lacking = any(self._default(*key) <= 0 for key in keys)
         for k, key in enumerate(keys):
@@ -562,7 +562,7 @@ class _Draft:
                 )
 
     def _correct_factors(self) -> None:
-        """Let the factors of vl be 1 and more: none divides by 0, and directions are not turned round."""
+        """Require at least 1 in the factors of vl: 0 would divide, and negative ones would reverse directions."""
         for key in self._vl_factors().values():
             row = self._section(key)
             row["LowLimit"] = str(max(number_of(row.get("LowLimit", "")) or 0, 1))
@@ -577,7 +577,7 @@ class _Draft:
         return self._sections[name] if name in self._sections else self._sections[object_section(key[0])]
 
     def _drop_twinless(self) -> None:
-        """Leave out objects of further axes that the first axis lacks: their meaning cannot be known from the first."""
+        """Remove objects of further axes that the first axis lacks: their meaning cannot be derived."""
         for index, sub in list(self._types):
             first = cia402.of_first_axis(index)
             if self._axes > 1 and first != index and (first, sub) not in self._types and index in cia402.PROFILE_AREAS:
@@ -724,7 +724,7 @@ class _Draft:
 
 
 def _why_not(method: int) -> str:
-    """Return why the emulator lacks a method of homing that an EDS lists."""
+    """Return why the emulator lacks a homing method that an EDS lists."""
     if method < 0:
         return "negative numbers are the maker's own methods"
     if method in HOMING_METHODS:
@@ -737,7 +737,7 @@ def _text(key: Key) -> str:
 
 
 def _shown(unit: str) -> str:
-    """Return a unit as the EDS has it: the unit of a position is an increment, whatever its limits mean."""
+    """Return a unit as written in the EDS: a position's unit is an increment, whatever its limits mean."""
     return "inc" if unit in ("counter", "position window", "position limit") else unit
 
 

@@ -1,7 +1,7 @@
 """A new device on EtherCAT: its dictionary with images, and the table `ethercat` of its data.
 
-The images are those of the ESI, or what the mapping objects of the EDS (1600h and 1A00h on) make; where neither can
-move the drive in a cyclic mode, it is given images for csp, csv and cst. What belongs to CAN alone is left out.
+The images are those of the ESI, or those of the EDS' mapping objects (1600h and 1A00h on); if neither can move the
+drive in a cyclic mode, it gets images for csp, csv and cst. Objects that belong only to CAN are left out.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from drive_env.dictionary.eds_file import UNSIGNED, EdsFile, Section, object_sec
 from drive_env.dictionary.eds_values import number_of
 from drive_env.dictionary.entries import INTEGER_TYPES, EdsText, eds_file
 
-ASSIGNMENTS = {True: 0x1C12, False: 0x1C13}  # what sync managers 2 and 3 carry
+ASSIGNMENTS = {True: 0x1C12, False: 0x1C13}  # the objects that sync managers 2 and 3 carry
 SYNC_MANAGER_TYPES = 0x1C00
 IDENTITY = 0x1018
 # SYNC, emergencies, heartbeat, guarding, error behaviour, SDO channels and PDOs of CANopen.
@@ -35,11 +35,11 @@ ONLY_ON_CAN = (
 )  # fmt: skip
 WIDTHS = (8, 16, 32, 64)  # bits of objects that an image carries
 LONGEST_GAP = 64  # bits
-ROOM = 8  # entries of an axis that a mapping object of ours takes
+ROOM = 8  # entries of an axis that our mapping objects hold
 ALWAYS_SHOWN = ("name", "title", "activation")  # keys of a clock's row
 SMALLEST_EEPROM, BESIDE_IMAGES, CLOCK_ROW = 2048, 600, 24  # bytes; a name, type and group of 100 letters each in it
 BUFFERS = 3  # of a sync manager with process data
-# Images of a drive that has none: by their mode the object that is followed.
+# Images for a drive without any: by mode, the object that is followed.
 OWN_SET = (("csp", cia402.TARGET_POSITION), ("csv", cia402.TARGET_VELOCITY), ("cst", cia402.TARGET_TORQUE),
            ("vl", cia402.VL_TARGET_VELOCITY))  # fmt: skip
 SHOWN = (cia402.STATUSWORD, cia402.MODE_DISPLAY, cia402.POSITION_ACTUAL, cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL,
@@ -52,7 +52,7 @@ CLASS_LAYOUT = EtherCatBehaviour(
 
 @dataclass(frozen=True, slots=True)
 class _Pdo:
-    """A mapping object to be written: `raws` are its entries, `room` how many it takes."""
+    """A mapping object to be written: `raws` are its entries, `room` the number that it can hold."""
 
     index: int
     name: str
@@ -73,13 +73,13 @@ class _Pdo:
 
 
 class EtherCatPart(NamedTuple):
-    """What EtherCAT makes of a new device.
+    """A new device's part for EtherCAT.
 
     Attributes:
         eds: Its dictionary, with images.
         behaviour: The table `ethercat`.
-        class_values: What a person must check: what, and why.
-        changes: What was put right, left out or not taken: where, and what.
+        class_values: Values that a person must check, with reasons.
+        changes: Repairs and omissions: place, and change.
     """
 
     eds: EdsText
@@ -119,14 +119,14 @@ def ethercat_part(eds: Path | None, esi: VendorEsi | None, source: str) -> Ether
         source: The file or files, for messages.
 
     Raises:
-        ValueError: For an ESI without a dictionary and without an EDS beside it, one that describes no drive, or images
-            that a slave has no room for.
+        ValueError: For an ESI without a dictionary and without an EDS beside it, one that does not describe a drive, or
+            images that are too long for a slave.
     """
     return _Maker(eds, esi, source).part()
 
 
 class _Maker:
-    """One device in the making."""
+    """A device in progress."""
 
     def __init__(self, eds: Path | None, esi: VendorEsi | None, source: str) -> None:
         self._esi, self._source = esi, source
@@ -252,7 +252,7 @@ class _Maker:
     def _pdo(
         self, index: int, name: str, is_output: bool, is_fixed: bool, rows: Sequence[tuple[int, int, int]]
     ) -> _Pdo:
-        """Return a mapping object of entries: index, sub-index and bits of each; what cannot be carried is a gap."""
+        """Return a mapping object of entries: index, sub-index and bits of each; impossible entries become gaps."""
         raws: list[int] = []
         at = 0
         for mapped, sub, bits in rows:
@@ -279,7 +279,7 @@ class _Maker:
     def _why_a_gap(self, index: int, sub: int, bits: int, at: int, *, is_output: bool) -> str | None:
         """Return why an image cannot carry an object, "" if it can; None for a gap of the file itself."""
         variable = self._types.get((index, sub))
-        if index == 0 or (variable is None and index < 0x20):  # of CANopen, dummies are data types
+        if index == 0 or (variable is None and index < 0x20):  # CANopen's dummies are data types
             return None
         if variable is None:
             return "does not exist"
@@ -300,7 +300,7 @@ class _Maker:
         return ""
 
     def _assigned(self, is_output: bool, pdos: Sequence[_Pdo]) -> list[_Pdo]:
-        """Return the images that a sync manager carries at first."""
+        """Return the images that a sync manager carries initially."""
         mine = {pdo.index: pdo for pdo in pdos if pdo.is_output == is_output}
         if self._esi is not None:
             return [mine[pdo.index] for pdo in self._esi.pdos if pdo.index in mine and pdo.is_assigned]
@@ -313,14 +313,14 @@ class _Maker:
             return whole[:1]
         found: list[_Pdo] = []
         taken: set[Key] = set()
-        for pdo in mine.values():  # of CANopen's PDOs those that together have each object once
+        for pdo in mine.values():  # of CANopen's PDOs, those that together have each object once
             if pdo.keys and not pdo.keys & taken:
                 found.append(pdo)
                 taken |= pdo.keys
         return found
 
     def _essential(self, is_output: bool) -> set[Key]:
-        """Return the objects of an image by which every axis follows a position."""
+        """Return the objects that an image needs so that every axis can follow a position."""
         indices = (cia402.CONTROLWORD, cia402.TARGET_POSITION) if is_output else SHOWN[::2][:2]
         return {
             (index + axis * cia402.AXIS_OFFSET, 0)
@@ -330,7 +330,7 @@ class _Maker:
         }
 
     def _serves(self, is_output: bool, assigned: Sequence[_Pdo]) -> bool:
-        """Return whether images command every axis by a cyclic target of any mode, or show where it is."""
+        """Return whether images command every axis by a cyclic target of any mode, or show every axis' position."""
         found = {key for pdo in assigned for key in pdo.keys}
         word = cia402.CONTROLWORD if is_output else cia402.STATUSWORD
         shown = cia402.POSITION_ACTUAL if (cia402.POSITION_ACTUAL, 0) in self._types else cia402.VL_VELOCITY_ACTUAL
@@ -364,7 +364,7 @@ class _Maker:
         return own
 
     def _entries_of_axes(self, indices: Iterable[int]) -> list[tuple[int, int, int]]:
-        """Return entries of every axis; each begins where its length divides, gaps are between."""
+        """Return entries of every axis, aligned to their length, with gaps between."""
         rows: list[tuple[int, int, int]] = []
         at = 0
         for axis in range(self._axes):
@@ -402,7 +402,7 @@ class _Maker:
         return one
 
     def _eeprom(self, pdos: Sequence[_Pdo], one: EtherCatBehaviour) -> int:
-        """Return a size [bytes] that holds all that the EEPROM says of images: a power of two, as its chips have."""
+        """Return an EEPROM size [bytes] that holds all images: a power of two, as of EEPROM chips."""
         texts = {pdo.name for pdo in pdos} | {mode.name for mode in one.clocks} | {mode.title for mode in one.clocks}
         for index, sub in {key for pdo in pdos for key in pdo.keys}:
             sections = (object_section(index), object_section(index, sub))
@@ -416,7 +416,7 @@ class _Maker:
         return size
 
     def _check_places(self, one: EtherCatBehaviour, assigned: Mapping[bool, Sequence[_Pdo]]) -> None:
-        """Raise ValueError for sync managers that lie in one another, or beyond the memory."""
+        """Raise ValueError for sync managers that overlap or exceed the memory."""
         sizes = [BUFFERS * sum(pdo.size for pdo in assigned[is_output]) for is_output in (True, False)]
         places = [("MBoxOut", *one.receive), ("MBoxIn", *one.send), ("Outputs", one.outputs, sizes[0]),
                   ("Inputs", one.inputs, sizes[1])]  # fmt: skip
@@ -436,7 +436,7 @@ class _Maker:
     def _write(
         self, pdos: Sequence[_Pdo], assigned: Mapping[bool, Sequence[_Pdo]], behaviour: EtherCatBehaviour
     ) -> None:
-        """Put mapping objects, assignments and identity into the dictionary, in place of what is there."""
+        """Write mapping objects, assignments and identity into the dictionary, replacing existing ones."""
         gone = {SYNC_MANAGER_TYPES, *ASSIGNMENTS.values(), *RX_PDOS, *TX_PDOS}
         for name in list(self._sections):
             place = place_of(name)
@@ -465,7 +465,7 @@ class _Maker:
             }  # fmt: skip
 
     def _write_identity(self) -> None:
-        """Have 1018h tell vendor, product and revision, as the ESI does, or [DeviceInfo] where the EDS lacks them."""
+        """Set vendor, product and revision in 1018h to those of the ESI, or of [DeviceInfo] if the EDS lacks them."""
         info = self._sections.setdefault("DeviceInfo", {})
         if self._esi is not None:
             info |= _device_info(self._esi)

@@ -1,12 +1,10 @@
-"""A device's folder, one that ships or one of one's own: all of it is data.
+"""A device's folder, shipped or the user's own: it is all data.
 
-    device.toml     rates, limits, causes, what it does on a bus; what it leaves out is as defaults.toml has it
-    *.eds           its dictionary; device.toml names it
-    bindings.toml   "index:sub" = { field, unit, part, event }: which object is which field of the drive record
-    roles.toml      which object plays which part
-    gains.toml      its gains, and the cascade that they belong to
-    commissioning.toml   may be left out: what is written for a motor, by a rule (commissioning.py)
-    presets/        <motor>.toml for each motor that it is commissioned for otherwise
+    device.toml rates, limits, causes, behaviour on a bus; missing keys are those of defaults.toml *.eds its dictionary;
+    device.toml names it bindings.toml "index:sub" = { field, unit, part, event }: the field of the drive record of each
+    object roles.toml the object of each role gains.toml its gains, and the cascade that they belong to
+    commissioning.toml optional: values for a motor, by a rule (commissioning.py) presets/ <motor>.toml for each motor
+    with other values
 
 Nothing in the folder is executed.
 """
@@ -54,10 +52,10 @@ def own_data(folder: Path) -> dict[str, Any]:
 
 
 def bindings_of(folder: Path, data: Mapping[str, Any]) -> dict[Key, Binding]:
-    """Return the bindings in a folder's `bindings.toml`, and those of its family, in the order of their objects.
+    """Return the bindings of a folder's `bindings.toml` and of its family, in the order of their objects.
 
     Raises:
-        ValueError: For a unit that there is not, with a near one.
+        ValueError: For an unknown unit, with a similar name.
     """
     rows: dict[str, dict[str, Any]] = data.get("bindings", {}) | read_toml(folder / BINDINGS)
     bindings = {}
@@ -71,7 +69,7 @@ def bindings_of(folder: Path, data: Mapping[str, Any]) -> dict[Key, Binding]:
 
 
 def check_scale(roles: Mapping[Role, Key], dictionary: ObjectDictionary) -> None:
-    """Raise ValueError for factory values that make no scale of positions."""
+    """Raise ValueError for factory values that give no scale of positions."""
     scale = position_scale(roles)
     if scale is None:
         return
@@ -84,7 +82,7 @@ def check_scale(roles: Mapping[Role, Key], dictionary: ObjectDictionary) -> None
     values = [dictionary.find(key).default for key in scale.keys]
     with np.errstate(divide="ignore", invalid="ignore"):
         units = float(scale.increments([np.array(float(value)) for value in values]))
-    if not is_scale(units) and values != [0]:  # an object of its own that is 0 is set by the commissioning
+    if not is_scale(units) and values != [0]:  # the emulator's own object that is 0 is set by the commissioning
         told = ", ".join(
             f"{dictionary.find(key).label} = {value}" for key, value in zip(scale.keys, values, strict=True)
         )
@@ -96,7 +94,7 @@ def check_scale(roles: Mapping[Role, Key], dictionary: ObjectDictionary) -> None
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Turn whatever is wrong in a device's file into a ValueError that names the file."""
+    """Turn any error in a device's file into a ValueError that names the file."""
     try:
         yield
     except OSError as error:

@@ -1,6 +1,6 @@
-"""Parts of a CANopen node that a device has or lacks, and its quirks: the tables `services` and `quirks` of `canopen`.
+"""Optional services of a device's CANopen node, and its quirks: the tables `services` and `quirks` of `canopen`.
 
-A table that is left out, and a key that is left out of it, is a part that the device lacks, or the standard's way.
+A missing table or key means that the device lacks the service, or follows the standard.
 """
 
 from __future__ import annotations
@@ -11,26 +11,26 @@ from typing import Any, NamedTuple
 from mechanics.reading.near_names import did_you_mean
 
 LSS_BIT_RATES = (1000, 800, 500, 250, 125, 50, 20, 10)  # kbit/s of CiA 305's table
-# Causes that a device's table of emergencies may have besides: SYNC of another length than 1019h says, and PDOs that
-# came later than 1007h allows.
+# Optional causes in a device's table of emergencies: a SYNC of another length than 1019h gives, and PDOs later than
+# 1007h allows.
 OPTIONAL_EMERGENCIES = ("sync_length", "sync_window_missed")
 BIT_30 = ("keep", "refuse", "store")
 
 
 class NodeServices(NamedTuple):
-    """Parts of a node beyond those of every node; objects of a dictionary switch theirs on.
+    """Optional services of a node.
 
-    1003h, 1007h, 1019h and 1012h with 1013h need no row here: the node has them where its EDS does.
+    Those of 1003h, 1007h, 1019h and 1012h with 1013h need no row here: the node has them if its EDS does.
 
     Attributes:
-        block_size: Segments of a block SDO transfer that the server takes at a time, 1 to 127; 0: it has none.
-        longest_text: Bytes of a string or domain that it takes; 0: only numbers can be written.
-        sync_producer: Bit 30 of 1005h makes it produce SYNC, every 1006h.
-        time_producer: Bit 30 of 1012h makes it produce TIME.
+        block_size: Segments of a sub-block of SDO block transfers, 1 to 127; 0: no block transfers.
+        longest_text: Longest string or domain that it accepts [bytes]; 0: only numbers can be written.
+        sync_producer: Whether bit 30 of 1005h makes it produce SYNC with the period of 1006h.
+        time_producer: Whether bit 30 of 1012h makes it produce TIME.
         time_period: Seconds between two TIME messages that it produces.
-        lss: It is a slave of the layer setting services (CiA 305).
+        lss: Whether it is a slave of the layer setting services (CiA 305).
         lss_bit_rates: Bit rates [kbit/s] that LSS may set.
-        lss_stores: It keeps what LSS has set.
+        lss_stores: Whether it stores the settings of LSS.
     """
 
     block_size: int = 0
@@ -44,18 +44,20 @@ class NodeServices(NamedTuple):
 
 
 class NodeQuirks(NamedTuple):
-    """Where a node differs from the standard.
+    """Deviations of a node from the standard.
 
     Attributes:
-        rpdo_bit_30: What comes of bit 30 in the COB-ID of an RPDO, which CiA 301 does not define there: "keep": what is
-            written is ignored, and it reads as the factory's; "refuse": a value with another bit 30 than the factory's
-            is refused with 06090030h; "store": it reads as it was written.
-        history_tells_number: 1003h has the first additional byte of the emergency in bits 24 to 29.
+        rpdo_bit_30: Handling of bit 30 in the COB-ID of an RPDO, which CiA 301 does not define there. "keep": the
+            factory's bit stays, whatever is written; "refuse": another bit than the factory's is refused with
+            06090030h; "store": the written bit is stored.
+        history_tells_number: Whether 1003h has the first additional byte of the emergency in bits 24 to 29.
         further_axis_bit: Bits of 1001h that are set while an axis other than the first has an error.
         unused_register_bits: Bits of 1001h that no error sets.
-        empty_history_reads_0: A sub-index of 1003h that has no error yet reads 0; else it is refused with 08000024h.
-        stores_mapped: 1010h stores what a PDO can carry, too, unless it commands something.
-        pdo_changes_while_on: A PDO's identifier and inhibit time can be written without setting its bit 31 before.
+        empty_history_reads_0: Whether a sub-index of 1003h without an error yet reads 0; otherwise it is refused with
+            08000024h.
+        stores_mapped: Whether 1010h also stores mappable objects, except commands.
+        pdo_changes_while_on: Whether a PDO's identifier and inhibit time can be written without setting its bit 31
+            first.
     """
 
     rpdo_bit_30: str = "keep"
@@ -68,7 +70,7 @@ class NodeQuirks(NamedTuple):
 
 
 def services_of(data: Mapping[str, Any]) -> NodeServices:
-    """Return the services of a device's table `canopen`; ValueError for a key or a value that cannot be."""
+    """Return the services of a device's table `canopen`; ValueError for an invalid key or value."""
     row = _known(data.get("services", {}), NodeServices, "services")
     found = NodeServices(**{**row, "lss_bit_rates": tuple(row.get("lss_bit_rates", LSS_BIT_RATES))})
     if not 0 <= found.block_size <= 127:
@@ -87,7 +89,7 @@ def services_of(data: Mapping[str, Any]) -> NodeServices:
 
 
 def node_quirks_of(data: Mapping[str, Any]) -> NodeQuirks:
-    """Return the quirks of a device's table `canopen`; ValueError for a key or a value that cannot be."""
+    """Return the quirks of a device's table `canopen`; ValueError for an invalid key or value."""
     found = NodeQuirks(**_known(data.get("quirks", {}), NodeQuirks, "quirks"))
     if found.rpdo_bit_30 not in BIT_30:
         raise ValueError(f"canopen.quirks.rpdo_bit_30 = {found.rpdo_bit_30!r} must be {', '.join(BIT_30)}")
@@ -95,7 +97,7 @@ def node_quirks_of(data: Mapping[str, Any]) -> NodeQuirks:
 
 
 def _known(row: Mapping[str, Any], kind: Any, table: str) -> dict[str, Any]:
-    """Return a table whose keys are those of a class, its values of their defaults' types."""
+    """Check that a table's keys are fields of a class and its values of their defaults' types; return it."""
     for key, value in row.items():
         default = kind._field_defaults.get(key)
         if default is None:

@@ -1,8 +1,8 @@
-"""Objects of CiA 402 that this emulator gives an effect, and the substitutes for those that a drive lacks.
+"""Objects of CiA 402 that have an effect in this emulator, and substitutes for those that a drive lacks.
 
-They are data, as a device's own are: `standard.toml`. A row of `STANDARD` binds an object of the standard to a field of
-the drive record; its unit is one of `dictionary/units.py`, or the name of a quantity that each drive counts in its own
-unit: velocity, acceleration, torque.
+They are data in `standard.toml`. A row of `STANDARD` binds an object of the standard to a field of the drive record;
+its unit is one of `dictionary/units.py`, or the name of a quantity that has a unit of the drive: velocity,
+acceleration, torque.
 """
 
 from __future__ import annotations
@@ -17,25 +17,25 @@ from drive_env.dictionary.bindings import Binding
 from mechanics.reading.untrusted import read_toml
 
 TORQUE = "torque"
-# Numbers of 6098h that homing knows (firmware/common/modes/hm.py).
+# Values of 6098h that are implemented (firmware/common/modes/hm.py).
 HOMING_METHODS = (*range(1, 15), *range(17, 31), 33, 34, 35, 37)
 HOMING_HERE = (35, 37)  # which need no switch
-# Values of 605Ah that the automaton knows (firmware/common/fsa.py).
+# Values of 605Ah that are implemented (firmware/common/fsa.py).
 QUICK_STOP_OPTIONS = (1, 2, 5, 6)
-# Objects whose value the emulator shows or obeys by itself, without a field of the record.
+# Objects that the emulator shows or obeys without a field of the record.
 BY_THEMSELVES = (cia402.ERROR_CODE, cia402.SUPPORTED_MODES)
 
 
 class OwnObject(NamedTuple):
-    """An object of the emulator's own, where a drive has none.
+    """An object of the emulator's own, for a drive that lacks one.
 
     Attributes:
         name, kind: Its name and its type, one of variants.py.
-        field, unit: The field that it is, and in which unit.
+        field, unit: Its field, and the unit.
         why: What the EDS lacks.
-        role: The part that it plays; "" for none.
-        modes: Modes of operation that need it; empty: every drive does.
-        unless: A field that does the same where an object has it; "" for none.
+        role: Its role; "" if it has none.
+        modes: Modes of operation that need it; empty: every drive needs it.
+        unless: A field that serves the same purpose if an object has it; "" if there is none.
     """
 
     name: str

@@ -1,12 +1,11 @@
-"""Variants: devices that are another device but for a few rows of data.
+"""Variants: devices that differ from another device in a few rows of data.
 
-A variant's `device.toml` names the device that it is a variant of (`variant_of`) and holds what differs: values under
-the same keys as there, and two tables. `[groups]` has records and arrays, `[objects]` entries, "index:sub" with what
-differs of the device's EDS; an entry that the device lacks has all of it:
+A variant's `device.toml` names the device that it is a variant of (`variant_of`) and holds the differences: values
+under the same keys as there, and two tables. `[groups]` has records and arrays, `[objects]` entries by "index:sub",
+with their differences from the device's EDS; a new entry has all keys:
 
-    name, access, default, low, high, unit, mappable   as the EDS has them; limits may be left out
-    type      u8 ... u32, i8 ... i32, text, bytes, domain
-    field     field of the drive record that it is, in `unit`; without one a value that is stored
+    name, access, default, low, high, unit, mappable as in the EDS; limits are optional type u8 ... u32, i8 ... i32,
+    text, bytes, domain field its field of the drive record, in `unit`; without one it is a stored value
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ from drive_env.dictionary.entries import EdsText, ObjectDictionary
 from mechanics.reading.near_names import did_you_mean
 from mechanics.reading.untrusted import read_toml
 
-FAMILIES = ("stepper",)  # each a file beside `DEFAULTS`
+FAMILIES = ("stepper",)  # each has a file beside `DEFAULTS`
 DEFAULTS = Path(__file__).parent / "defaults.toml"
 
 # Data types of CiA 301, table 44; codes of object types of CiA 306.
@@ -38,12 +37,12 @@ TYPES = {
     "text": 0x09, "bytes": 0x0A, "domain": 0x0F,
 }  # fmt: skip
 VARIABLE, GROUPS = "0x7", {"array": "0x8", "record": "0x9"}
-# Keys of a row, and those of the EDS.
+# Keys of a row, and their keys in the EDS.
 _KEYS = {"name": "ParameterName", "access": "AccessType", "default": "DefaultValue", "low": "LowLimit",
          "high": "HighLimit", "unit": "Unit"}  # fmt: skip
 _MAKERS = range(0x2000, cia402.PROFILE_AREAS.start)
 _LISTS = (("MandatoryObjects", (0x1000, 0x1001, 0x1018)), ("ManufacturerObjects", _MAKERS))
-_FACTORY_SCALE = 65536.0  # increments of a revolution where a preset says nothing else
+_FACTORY_SCALE = 65536.0  # increments per revolution if a preset has no value
 
 
 def parse_key(text: str) -> Key:
@@ -53,9 +52,9 @@ def parse_key(text: str) -> Key:
 
 
 def device_data(folder: Path) -> dict[str, Any]:
-    """Return a folder's `device.toml` laid over its family's file (`like`) and `defaults.toml`.
+    """Return a folder's `device.toml`, completed by its family's file (`like`) and `defaults.toml`.
 
-    A variant's is returned as it is.
+    A variant's is returned unchanged.
 
     Raises:
         ValueError: If it cannot be read, or names an unknown family.
@@ -72,7 +71,7 @@ def device_data(folder: Path) -> dict[str, Any]:
 
 
 def merged(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a device's data with a variant's in their place; tables are merged, everything else is replaced."""
+    """Return a device's data with a variant's: tables are merged, all other values replaced."""
     result = dict(base)
     for name, value in own.items():
         before = base.get(name)
@@ -81,14 +80,14 @@ def merged(base: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def own_variant(path: Path, devices: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the data of a variant in a file of one's own: a power stage's limits, rates, and objects if need be.
+    """Return the data of a variant in the user's own file: a power stage's limits, rates, and optionally objects.
 
     Args:
         path: The file; it names the device that it is a variant of.
-        devices: Data of the devices there are, by name.
+        devices: Data of the known devices, by name.
 
     Raises:
-        ValueError: If the file cannot be read, or has what a variant cannot have, with the remedy.
+        ValueError: If the file cannot be read, or has data that a variant cannot have, with the remedy.
     """
     try:
         own = read_toml(path)
@@ -122,10 +121,10 @@ def own_variant(path: Path, devices: Mapping[str, Mapping[str, Any]]) -> dict[st
 
 
 def _check_currents(path: Path, current: Mapping[str, float], base: Mapping[str, float]) -> None:
-    """Raise ValueError for currents [A] that are out of order, by how the base's own follow each other.
+    """Raise ValueError for currents [A] in another order than those of the base.
 
     A drive that measures its currents cannot see an overcurrent beyond its range; one whose bridges detect shorts, as
-    drives of steppers do, has its threshold above the largest current that it makes.
+    in stepper drives, has its threshold above its largest current.
     """
     measures = base["overcurrent"] <= base["full_scale"]
     names, meanings = (
@@ -139,7 +138,7 @@ def _check_currents(path: Path, current: Mapping[str, float], base: Mapping[str,
 
 
 def _with_optional_rows(base: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a device's data with the rows that it lacks and a variant may have, each as one of its kind is."""
+    """Return a device's data with the rows that it lacks and a variant may have, filled in from similar rows."""
     emergencies, canopen = base["emergencies"], base["canopen"]
     more = dict.fromkeys(OPTIONAL_EMERGENCIES, emergencies["fault_reset"])
     objects = {"serial_number": "1018:4", **canopen["objects"]}
@@ -147,7 +146,7 @@ def _with_optional_rows(base: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def check_rates(rates: Mapping[str, float]) -> None:
-    """Raise ValueError for rates [Hz] that are no whole multiples of each other, from the fastest to the slowest."""
+    """Raise ValueError for rates [Hz] that are not whole multiples of each other, from the fastest to the slowest."""
     chain = [rates[name] for name in ("current", "velocity", "supervision", "communication")]
     if any(slow <= 0 or fast % slow for fast, slow in itertools.pairwise(chain)):
         raise ValueError(
@@ -157,7 +156,7 @@ def check_rates(rates: Mapping[str, float]) -> None:
 
 
 def _check_like(where: str, value: Any, known: Any, base: Mapping[str, Any]) -> None:
-    """Raise ValueError unless a value is of the kind that the device's data have there; numbers are above 0."""
+    """Raise ValueError unless a value has the type of the device's data there; numbers must be above 0."""
     if known is None:
         name = where.rsplit(" ", 1)[-1]
         raise ValueError(f"{where} is nothing that a device has{did_you_mean(name, base)}")
@@ -180,7 +179,7 @@ def compose_eds(name: str, base: str, data: Mapping[str, Any]) -> EdsText:
     """Return the EDS of a variant: the device's text with the variant's rows.
 
     Args:
-        name: Of the file that it would be.
+        name: Name of the file that it would be.
         base: The device's EDS.
         data: The variant's own data.
     """
@@ -203,7 +202,7 @@ def compose_eds(name: str, base: str, data: Mapping[str, Any]) -> EdsText:
 
 
 def variant_bindings(base: Mapping[Key, Binding], rows: Mapping[str, Mapping[str, Any]]) -> dict[Key, Binding]:
-    """Return a device's bindings with those of a variant's rows, and in the units that these name."""
+    """Return a device's bindings with those of a variant's rows, in the units named there."""
     bindings = dict(base)
     for text, row in rows.items():
         key = parse_key(text)
@@ -222,9 +221,9 @@ def converted_preset(
 
     Args:
         preset: Object name -> raw value.
-        entries: Of the variant.
+        entries: The variant's entries.
         before: The device's bindings.
-        after: The variant's.
+        after: The variant's bindings.
     """
     keys = {name: (entry.index, entry.sub) for name in preset for entry in [entries.find(name)]}
     scale = next((float(preset[name]) for name, key in keys.items() if key == (0x2058, 0)), _FACTORY_SCALE)
@@ -240,14 +239,13 @@ def converted_preset(
 
 
 def _section(eds: configparser.RawConfigParser, index: int, sub: int) -> str:
-    """Return the name of an entry's section; a variable is its own."""
+    """Return the name of an entry's section; a variable is in its object's section."""
     top = f"{index:04X}"
     is_group = top in eds and eds[top]["ObjectType"] in GROUPS.values()
     return f"{top}sub{sub:X}" if is_group else top
 
 
 def _eds(row: Mapping[str, Any]) -> dict[str, str]:
-    """Return a row's keys as the EDS has them."""
     found = {_KEYS[key]: str(value) for key, value in row.items() if key in _KEYS}
     if "type" in row:
         found["DataType"] = f"0x{TYPES[row['type']]:04X}"
@@ -257,7 +255,7 @@ def _eds(row: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _count(eds: configparser.RawConfigParser) -> None:
-    """Bring the lists of objects, and the number of sub-indices of each, in line with the sections."""
+    """Update the lists of objects, and the number of sub-indices of each, to the sections."""
     indices = sorted(int(name, 16) for name in eds.sections() if len(name) == 4 and _is_hexadecimal(name))
     listed: set[int] = set()
     for group, members in _LISTS:

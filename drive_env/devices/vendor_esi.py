@@ -1,7 +1,7 @@
-"""A maker's EtherCAT Slave Information (ESI, ETG.2000): one device of it, as far as a drive here has it.
+"""A maker's EtherCAT Slave Information (ESI, ETG.2000): one device of it, as far as it is supported here.
 
-Anybody may have written the file: a text in place of a number, or a number beyond its range, ends reading with its
-place, its value and the range. What a drive here has not (EoE, modules, commands at start-up) is listed, and not taken.
+The file is not trusted: text in place of a number, or a number beyond its range, ends reading with place, value and
+range. Unsupported data (EoE, modules, commands at start-up) are listed and ignored.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ MOST_EEPROM = 1 << 20  # bytes
 NOT_HERE = ("EoE", "AoE", "SoE", "VoE")
 U8, U16, U32, U64, I16, I32 = 0xFF, 0xFFFF, 0xFFFFFFFF, (1 << 64) - 1, 0x7FFF, 0x7FFFFFFF
 LONGEST_TEXT = 100  # letters of a name
-CLASS_EEPROM, CLASS_CYCLE = 4096, 250e-6  # bytes, s: what no ESI says
+CLASS_EEPROM, CLASS_CYCLE = 4096, 250e-6  # bytes, s: values that no ESI has
 
 
 @dataclass(frozen=True, slots=True)
 class EsiEntry:
-    """An entry of an image: its object, index 0 for a gap; length [bits]; name and type as the file has them."""
+    """An entry of an image: its object, index 0 for a gap; length [bits]; name and type as in the file."""
 
     index: int
     sub: int
@@ -51,7 +51,7 @@ class EsiEntry:
 
 @dataclass(frozen=True, slots=True)
 class EsiPdo:
-    """An image, or a part of one: its mapping object, whether it goes into the drive, is assigned, is ready-made."""
+    """An image, or part of one: its mapping object, whether it is sent to the drive, assigned, ready-made."""
 
     index: int
     name: str
@@ -67,11 +67,11 @@ class VendorEsi(NamedTuple):
 
     Attributes:
         vendor, product, revision: Its identity.
-        maker, name: As a person reads them.
+        maker, name: Its names for people.
         behaviour: Its mailboxes, sync managers and clocks.
         pdos: Its images.
-        dictionary: `Profile/Dictionary`; None of a file without one.
-        unread: What of the file is not taken, and why.
+        dictionary: `Profile/Dictionary`; None if the file has none.
+        unread: Ignored data of the file, with reasons.
     """
 
     vendor: int
@@ -90,10 +90,11 @@ def read_esi(path: Path, product: str = "") -> VendorEsi:
 
     Args:
         path: The file.
-        product: Which device of several: its type, its product code, or "code:revision".
+        product: Selects one of several devices: its type, its product code, or "code:revision".
 
     Raises:
-        ValueError: For a file that is no ESI, describes no drive with CoE, or has several devices and none is named.
+        ValueError: For a file that is not an ESI, does not describe a drive with CoE, or has several devices if
+            `product` selects none.
     """
     if not path.is_file():
         raise ValueError(f"there is no ESI at {path}; give the path of the drive's .xml file")
@@ -111,7 +112,7 @@ def read_esi(path: Path, product: str = "") -> VendorEsi:
 
 
 def number(text: str | None, what: str, low: int, high: int) -> int:
-    """Return a number as ETG.2000 writes it, decimal, or #x and hexadecimal; ValueError names its place and range."""
+    """Parse a number of ETG.2000, decimal, or #x and hexadecimal; ValueError names its place and range."""
     plain = (text or "").strip()
     try:
         if len(plain) > LONGEST_TEXT:
@@ -127,20 +128,20 @@ def number(text: str | None, what: str, low: int, high: int) -> int:
 
 
 def text_of(parent: ET.Element, tag: str) -> str:
-    """Return the text of a child on one line, the English one of several; "" without it."""
+    """Return the text of a child on one line, in English if there are several; "" without it."""
     found = parent.findall(tag)
     best = next((one for one in found if one.get("LcId") in ("1033", None)), found[0] if found else None)
     return "" if best is None else one_line(best.text)
 
 
 def one_line(text: str | None) -> str:
-    """Return a text without ends of lines and other control characters, not longer than a name."""
+    """Return a text without line ends and other control characters, limited to the length of a name."""
     words = "".join(letter if letter.isprintable() else " " for letter in (text or "")[: 10 * LONGEST_TEXT]).split()
     return " ".join(words)[:LONGEST_TEXT]
 
 
 def is_set(element: ET.Element | None, name: str) -> bool:
-    """Return whether an attribute says yes."""
+    """Return whether an attribute is true."""
     return element is not None and element.get(name, "0").strip().lower() in ("1", "true")
 
 
@@ -157,7 +158,7 @@ class _Reader:
         self._unread: list[tuple[str, str]] = []
 
     def device(self, product: str) -> VendorEsi:
-        """Return the device that a text names; the only one without a text."""
+        """Return the device that a text selects; the only one for an empty text."""
         maker = self._root.find("Vendor")
         if maker is None:
             raise ValueError("it has no <Vendor>, by which masters know a device; add one with its Id")

@@ -1,8 +1,8 @@
-"""The units that a drive counts in, as its EDS tells them: scale of positions, speeds, accelerations, torques.
+"""The units of a drive according to its EDS: scale of positions, speeds, accelerations, torques.
 
 Positions follow 6092h over 6091h, an angle in 60A8h, or 608Fh; speeds and accelerations 60A9h and 60AAh, or the unit
-that the EDS writes beside an object. Where nothing tells a unit it is the standard's: units of position per second,
-thousandths of the rated torque. Angles are those of the shaft that 6092h counts, rpm those of the motor.
+that the EDS gives for an object. By default the unit is the standard's: units of position per second, thousandths of
+the rated torque. Angles are those of the shaft of 6092h, rpm those of the motor.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ ANGLES = {  # in revolutions
     REVOLUTIONS: 1.0,
 }
 TIMES = {SECOND: 1.0, MINUTE: 60.0, HOUR: 3600.0}  # in seconds
-# Units as EDS files write them beside an object, spaces left out, in lower case.
+# Units in EDS files, without spaces, in lower case.
 _WRITTEN = {
     **dict.fromkeys(("rpm", "r/min", "rev/min", "1/min", "min-1", "min^-1", "u/min"), "rpm"),
     **dict.fromkeys(("rps", "rev/s", "r/s", "1/s"), "60 rpm"),
@@ -47,7 +47,7 @@ _ANGLE = re.compile(r"(\d+(?:\.\d+)?)?\*?(m?)(deg|degree|degrees|\u00b0|rad)(/s|
 
 
 class Feed(NamedTuple):
-    """Units of position in a turn of the shaft that 6092h counts, and their source; 0 and "" without a source."""
+    """Position units per turn of the shaft of 6092h, and their source; 0 and "" if unknown."""
 
     units: float
     source: str
@@ -58,10 +58,10 @@ class VendorUnits(NamedTuple):
 
     Attributes:
         velocity, acceleration, torque: Names of units (dictionary/units.py).
-        scale: Name of a role -> object of the dictionary, of what makes the scale of positions; empty: nothing does.
-        increments: Units of position in a turn of the motor where they are known and no object has them, else 0.
-        sources: Quantity -> where its unit stands; "" where it is the standard's.
-        notes: Entries of the file that are not taken: object, and why.
+        scale: Name of a role -> object, for the objects that give the position scale; empty: there are none.
+        increments: Position units per turn of the motor if they are known but in no object, else 0.
+        sources: Quantity -> source of its unit; "" if it is the standard's.
+        notes: Ignored entries of the file: object, and reason.
     """
 
     velocity: str
@@ -78,8 +78,8 @@ def vendor_units(types: Mapping[Key, ODVariable], velocity: str = "", accelerati
 
     Args:
         types: Its entries.
-        velocity: Unit of speeds that a person gave, before all others.
-        acceleration: The same of accelerations.
+        velocity: The user's unit of speeds, which has precedence.
+        acceleration: The user's unit of accelerations, likewise.
     """
     notes: list[tuple[str, str]] = []
     scale, increments, feed = _scale(types, notes)
@@ -109,7 +109,7 @@ def vendor_units(types: Mapping[Key, ODVariable], velocity: str = "", accelerati
 
 
 class UnitCode(NamedTuple):
-    """The unit code of an object of 60A8h to 60AAh."""
+    """The unit code in an object of 60A8h to 60AAh."""
 
     prefix: float
     numerator: int
@@ -117,7 +117,7 @@ class UnitCode(NamedTuple):
 
     @property
     def is_angle(self) -> bool:
-        """Whether it is an angle by itself, which needs no encoder to be known."""
+        """Whether it is an angle, which is known without an encoder."""
         return self.numerator in ANGLES and self.denominator == DIMENSIONLESS
 
 
@@ -132,7 +132,7 @@ def _code(types: Mapping[Key, ODVariable], index: int) -> UnitCode | None:
 
 
 def _rate(code: UnitCode, bases: tuple[str, ...], feed: Feed, position: UnitCode | None) -> str:
-    """Return the unit of a code of a speed or an acceleration; "" for an unknown code."""
+    """Return the unit of a speed's or an acceleration's code; "" for an unknown code."""
     by_minute, counted = bases
     is_speed = by_minute == "rpm"
     if not is_speed and code.numerator == PER_MINUTE and code.denominator == SECOND:
@@ -147,12 +147,12 @@ def _rate(code: UnitCode, bases: tuple[str, ...], feed: Feed, position: UnitCode
     if code.numerator in (INCREMENTS, DIMENSIONLESS):
         return _times(code.prefix / seconds, counted)
     if position is not None and code.numerator == position.numerator:
-        return _times(code.prefix / position.prefix / seconds, counted)  # metres: as many units as positions have
+        return _times(code.prefix / position.prefix / seconds, counted)  # metres: the same units as positions
     return ""
 
 
 def _of_angle(turns: float, bases: tuple[str, ...], feed: Feed) -> str:
-    """Return the unit that so many turns of the shaft a second (squared) are: counted, where a turn has a number."""
+    """Return the unit of an angular rate [turns of the shaft/s^n]: in position units if they are known, else rpm."""
     by_minute, counted = bases
     return _times(turns * feed.units, counted) if feed.units else _times(60.0 * turns, by_minute)
 
@@ -165,7 +165,7 @@ def _told(
     notes: list[tuple[str, str]],
     objects: tuple[int, ...],
 ) -> tuple[str, str]:
-    """Return a unit and where it stands: as an object's code, or beside an object; two empty texts for none."""
+    """Return a unit and its source, an object's code or the text at an object; two empty texts without one."""
     code = _code(types, index)
     if code is not None:
         unit = _rate(code, bases, feed, _code(types, cia402.POSITION_UNIT))
@@ -189,9 +189,9 @@ def _shown(types: Mapping[Key, ODVariable], index: int) -> str:
 
 
 def written_angle(text: str) -> tuple[float, int]:
-    """Parse the angle a second, or second squared, that an EDS writes beside an object, in revolutions, with the power.
+    """Parse an angle per second, or second squared, as in an EDS: revolutions, and the power of the second.
 
-    "0.1 deg/s" is (0.1 / 360, 1), "rad/s^2" is (0.5 / pi, 2); (0.0, 0) for other texts.
+    "0.1 deg/s" is (0.1 / 360, 1), "rad/s^2" is (0.5 / pi, 2); (0.0, 0) for other text.
     """
     found = _ANGLE.match(re.sub(r"[\s\[\]]", "", text.lower()))
     if found is None:
@@ -202,7 +202,7 @@ def written_angle(text: str) -> tuple[float, int]:
 
 
 def written_unit(text: str) -> str:
-    """Return the name of a unit that an EDS writes beside an object: "0.1 r/min" is "0.1 rpm"; "" if unknown."""
+    """Return the name of a unit as given in an EDS: "0.1 r/min" is "0.1 rpm"; "" if unknown."""
     plain = re.sub(r"[\s\[\]]", "", text.lower())
     if plain in _WRITTEN:
         return _WRITTEN[plain]
@@ -221,7 +221,7 @@ def _times(number: float, base: str) -> str:
 
 
 def _scale(types: Mapping[Key, ODVariable], notes: list[tuple[str, str]]) -> tuple[dict[str, Key], int, Feed]:
-    """Return the objects that say how many units of position a turn of the motor has, or the number; and the feed."""
+    """Return the objects that give position units per turn of the motor, or that number; and the feed."""
     feed = {"feed": (cia402.FEED_CONSTANT, 1), "feed_turns": (cia402.FEED_CONSTANT, 2)}
     gear = {"gear_motor": (cia402.GEAR_RATIO, 1), "gear_shaft": (cia402.GEAR_RATIO, 2)}
     encoder = {"encoder_increments": (cia402.ENCODER_RESOLUTION, 1), "encoder_turns": (cia402.ENCODER_RESOLUTION, 2)}

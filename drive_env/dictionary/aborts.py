@@ -1,4 +1,4 @@
-"""The error of a dictionary's refusal, with its SDO abort code of CiA 301."""
+"""The error of a refused access to the dictionary, with its SDO abort code of CiA 301."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ NO_DATA = 0x08000024
 
 
 class ObjectAccessError(Exception):
-    """An access that the dictionary refuses; on the bus it is an SDO abort.
+    """An access that the dictionary refuses; on the bus it becomes an SDO abort.
 
     Attributes:
         abort_code: The SDO abort code of CiA 301.

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def check_readable(entry: Entry) -> None:
-    """Raise 06010001h for an entry that can only be written."""
+    """Raise 06010001h for a write-only entry."""
     if entry.access == "wo":
         raise ObjectAccessError(WRITE_ONLY, f"{entry.label} can only be written")
 
@@ -31,14 +31,14 @@ def check_readable(entry: Entry) -> None:
 def fits_pdo(entry: Entry, transmit: bool) -> bool:
     """Return whether a PDO of this direction can carry an entry, by PDOMapping and AccessType of its EDS (CiA 306).
 
-    `rww` is written by a process image, so RPDOs alone carry it; `rwr` is read by one, so TPDOs alone do. What is
-    `const` needs to be read once, so no PDO carries it.
+    `rww` is written by a process image, so only RPDOs carry it; `rwr` is read by one, so only TPDOs carry it. A `const`
+    needs to be read only once, so no PDO carries it.
     """
     return entry.pdo_mappable and entry.access in (("ro", "rw", "rwr") if transmit else ("wo", "rw", "rww"))
 
 
 def check_writable(entry: Entry) -> None:
-    """Raise 06010002h for an entry that can only be read."""
+    """Raise 06010002h for a read-only entry."""
     if entry.access in ("ro", "const"):
         raise ObjectAccessError(READ_ONLY, f"{entry.label} can only be read")
 
@@ -47,17 +47,17 @@ def checked_values(entry: Entry, value: Any, num_axes: int) -> Integers:
     """Return values as the wire carries them, int64 of shape (num_axes,), after the checks of type and range.
 
     Args:
-        entry: What is to be written.
+        entry: The entry to write.
         value: An integer or an array of them, one per axis.
         num_axes: Number of axes.
 
     Raises:
-        ObjectAccessError: 06070010h for what is no integer or does not fit the axes, 06090031h and 06090032h for a
-            value beyond the range.
+        ObjectAccessError: 06070010h for a value that is not an integer or does not fit the axes, 06090031h and
+            06090032h for a value beyond the range.
     """
     raw = _as_array(value)
     if raw.dtype == object and all(isinstance(item, int) for item in raw.flat):
-        _check_range(entry, raw)  # an integer beyond 64 bits
+        _check_range(entry, raw)  # raises for an integer beyond 64 bits
     if entry.bits is None or raw.dtype.kind not in "iu":
         kind = "a text" if entry.bits is None else f"a {entry.bits}-bit integer"
         raise ObjectAccessError(WRONG_TYPE, f"{entry.label} is {kind}; got {value!r}, which is {_describe(raw)}")
@@ -70,7 +70,7 @@ def checked_values(entry: Entry, value: Any, num_axes: int) -> Integers:
 
 
 def _as_array(value: Any) -> NDArray[Any]:
-    """Return the value as an array; one of objects, which has no integer type, if it is not numbers."""
+    """Return the value as an array; of dtype object if it is not numbers."""
     try:
         return np.asarray(value)
     except ValueError:
@@ -92,7 +92,7 @@ def check_allowed(entry: Entry, raw: Integers, allowed: tuple[int, ...]) -> None
 
 
 def _listed(values: tuple[int, ...]) -> str:
-    """Return ascending values for a message: three or more consecutive ones as a range."""
+    """Return ascending values as text for a message: three or more consecutive ones as a range."""
     runs: list[list[int]] = []
     for value in values:
         if runs and value == runs[-1][-1] + 1:
@@ -104,7 +104,7 @@ def _listed(values: tuple[int, ...]) -> str:
 
 
 def check_limits(entry: Entry, raw: int) -> None:
-    """Raise 06090031h or 06090032h unless one integer is within the entry's range."""
+    """Raise 06090031h or 06090032h unless an integer is within the entry's range."""
     if entry.low is None or entry.high is None:
         return
     if raw > entry.high:

@@ -1,4 +1,4 @@
-"""Objects of several axes, read and written: all that most of what knows a dictionary asks of drives."""
+"""Protocol of reading and writing objects of several axes, which suffices for most modules that know a dictionary."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mechanics.arrays import Integers, Mask
 
 
 class AxisObjects(Protocol):
-    """Objects of axes. Integers are those of the wire, one for each axis, shape (num_axes,)."""
+    """Reads and writes objects of axes. Integers are those on the bus, one for each axis, shape (num_axes,)."""
 
     @property
     def num_axes(self) -> int:

@@ -1,4 +1,4 @@
-"""Bindings: which object of the dictionary is which field of the drive record, in which unit."""
+"""Bindings: objects of the dictionary with their fields of the drive record and their units."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from dataclasses import dataclass
 class Binding:
     """A row of a device's table of bindings.
 
-    `event` names what a write sets off in the firmware: "controlword", "mode", "set_point", "whole_set_point" (of a
-    position by all of its bits) or nothing. `part` chooses
-    in a deep field. An object that `shows` a field is not the one whose stored value a restart puts there.
+    `event` names what a write triggers in the firmware: "controlword", "mode", "set_point", "whole_set_point" (of a
+    position with all of its bits) or nothing. `part` selects an element of a deep field. If an object only `shows` a
+    field, a restart does not restore the field from it.
     """
 
     index: int

@@ -1,7 +1,7 @@
-"""Integers on the wire to SI and back: one row for each object that is a field of the drive record.
+"""Integers on the bus to SI and back: one row for each object that is a field of the drive record.
 
-Whatever converts reads the same row: arrays of all axes (`decode`, `encode`), a fieldbus node that converts a few
-values of one axis a thousand times a second (`decode_one`, `encode_one`), and compiled code (emulator/prepared_record).
+All conversions read the same row: arrays of all axes (`decode`, `encode`), a fieldbus node that converts a few values
+of one axis a thousand times a second (`decode_one`, `encode_one`), and compiled code (emulator/prepared_record).
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from mechanics.arrays import Floats, Integers
 
 
 class Code(NamedTuple):
-    """How an object's integers are a field's SI values.
+    """The conversion between an object's integers and a field's SI values.
 
     Attributes:
-        field, part: Where in the record: a field, and the part of a deep one.
+        field, part: The field of the record, and the element of a deep one.
         unit: Name of a unit (`find_unit`), whose factor is SI per integer.
-        event: What a write sets off in the firmware, as in the binding.
-        low, high: Least and greatest integer; what lies beyond saturates, integers of `specials` excepted.
-        period: Number of integers of a counter that goes on past the end of its type; 0 for one that saturates.
-        specials: Integers that stand for an SI value which the factor does not give, with that value.
+        event: What a write triggers in the firmware, as in the binding. low, high: Least and greatest integer; others
+            saturate, except those of `specials`.
+        period: Number of integers of a counter that wraps at the end of its type; 0 for one that saturates.
+        specials: Integers with an SI value that does not follow from the factor, and that value.
         follows_scale: Whether the factor follows the scale of positions.
     """
 
@@ -43,7 +43,7 @@ class Code(NamedTuple):
     follows_scale: bool
 
     def factor(self, context: Context) -> Any:
-        """Return SI per integer, of one axis or of all; a scale of 0 gives infinity."""
+        """Return SI per integer, for one axis or all; a scale of 0 gives infinity."""
         try:
             return find_unit(self.unit).factor(context)
         except ZeroDivisionError:
@@ -51,17 +51,17 @@ class Code(NamedTuple):
 
     @property
     def least(self) -> int:
-        """Least integer that is computed by the factor."""
+        """Least integer that is converted by the factor."""
         return self.low + any(raw == self.low for raw, _ in self.specials) if self.specials else self.low
 
     @property
     def greatest(self) -> int:
-        """Greatest integer that is computed by the factor."""
+        """Greatest integer that is converted by the factor."""
         return self.high - any(raw == self.high for raw, _ in self.specials) if self.specials else self.high
 
 
 def code_of(entry: Entry, binding: Binding) -> Code:
-    """Return the row of a bound object."""
+    """Return the conversion row of a bound object."""
     assert entry.low is not None and entry.high is not None, "only numbers are bound"
     unit = find_unit(binding.unit)
     return Code(binding.field, binding.part, binding.unit, binding.event, entry.low, entry.high, unit.period,
@@ -114,15 +114,15 @@ def encode_one(code: Code, value: float, factor: float) -> int:
     return least if raw < least else greatest if raw > greatest else raw
 
 
-# Columns of a row as compiled code reads it.
+# Columns of a row in compiled code.
 LOW, HIGH, PERIOD, SPECIAL_RAW, SPECIAL_SI = 0, 1, 2, 3, 5
-SPECIALS = 2  # of a unit at most
+SPECIALS = 2  # at most, of a unit
 
 
 def compiled_rows(codes: Sequence[Code], *, decoded: bool) -> Floats:
     """Return rows as numbers, shape (n, 7): limits, period, special integers and their values; nan for a missing one.
 
-    The limits are those of integers that are decoded, or of what is encoded by the factor.
+    The limits are those for decoding, or for encoding by the factor.
     """
     rows = np.full((len(codes), SPECIAL_SI + SPECIALS), math.nan)
     for row, code in zip(rows, codes, strict=True):

@@ -1,4 +1,4 @@
-"""Checks that an EDS is of a CiA 402 drive: its axes, and objects that are integers with room for the standard's."""
+"""Checks that an EDS is of a CiA 402 drive: its axes, and objects that must be integers of the standard's width."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from drive_env.dictionary.eds_file import place_of_line
 from drive_env.dictionary.entries import INTEGER_TYPES, EdsText, eds_text, read_eds
 from drive_env.dictionary.standard_types import STANDARD_TYPES
 
-# Objects whose integers are taken apart bit by bit, or tell where an axis is and goes: their length [bits] by CiA 402.
-# A drive may have others; words and positions of fewer bits would lack some that a master goes by.
+# Objects whose bits are interpreted, or that give an axis' position or target: their width [bits] by CiA 402. A drive
+# may have wider ones; words and positions with fewer bits would lack some that a master uses.
 _NEEDED = (cia402.CONTROLWORD, cia402.STATUSWORD, cia402.POSITION_ACTUAL, cia402.TARGET_POSITION)
 _BITS = {
     8: (cia402.MODE, cia402.MODE_DISPLAY),
@@ -24,7 +24,7 @@ _BITS = {
 }
 KINDS: dict[Key, int] = {(index, 0): bits for bits, indices in _BITS.items() for index in indices}
 MOST_AXES = 8
-LONGEST = 32  # bits that one frame of SDO carries: a stop, and a look while an axis moves, wait for no second one
+LONGEST = 32  # bits that one SDO frame carries: stopping and watching a moving axis must not wait for a second one
 
 
 def read_types(path: Path | EdsText, node_id: int = 1) -> dict[Key, ODVariable]:
@@ -37,7 +37,7 @@ def read_types(path: Path | EdsText, node_id: int = 1) -> dict[Key, ODVariable]:
 
 
 def _check_values(path: Path | EdsText, types: Mapping[Key, ODVariable]) -> None:
-    """Raise ValueError for an object of which sub-index 0 is no value, but counts other sub-indices or is missing."""
+    """Raise ValueError for an object whose sub-index 0 is missing, or a count of sub-indices instead of a value."""
     for index in sorted({index for index, sub in types if sub > 0}):
         axis, first = divmod(index - cia402.PROFILE_AREAS.start, cia402.AXIS_OFFSET)
         bits = KINDS.get((cia402.PROFILE_AREAS.start + first, 0)) if 0 <= axis < MOST_AXES else None
@@ -54,17 +54,17 @@ def _check_values(path: Path | EdsText, types: Mapping[Key, ODVariable]) -> None
 
 
 def _line_of(path: Path | EdsText, index: int) -> str:
-    """Return ", line n" of an object's first section in an EDS; nothing where it has none."""
+    """Return ", line n" of an object's first section in an EDS; "" if it has no section."""
     found = (place and place[0] == index for place in map(place_of_line, eds_text(path).splitlines()))
     return next((f", line {number}" for number, is_it in enumerate(found, 1) if is_it), "")
 
 
 def axes_of(path: Path | EdsText, types: Mapping[Key, ODVariable]) -> int:
-    """Return how many axes an EDS describes.
+    """Return the number of axes that an EDS describes.
 
     Raises:
-        ValueError: If it describes no CiA 402 drive, or an object that decides what a drive does is no integer, or too
-            short.
+        ValueError: If it does not describe a CiA 402 drive, or an object that controls a drive is not an integer, or
+            too short.
     """
     _check_values(path, types)
     axes = sum((cia402.STATUSWORD + cia402.AXIS_OFFSET * axis, 0) in types for axis in range(MOST_AXES))
@@ -91,7 +91,7 @@ def _is_long_enough(index: int, bits: int, usual: int) -> bool:
 
 
 def other_widths(types: Mapping[Key, ODVariable]) -> Iterator[tuple[Key, int, int]]:
-    """Return the standard's objects of the first axis that an EDS has with other bits: these, and the standard's."""
+    """Yield the first axis' standard objects with another width in an EDS: its bits, and the standard's."""
     for index, (kind, _) in STANDARD_TYPES.items():
         for (one, sub), variable in types.items():
             found, usual = INTEGER_TYPES.get(variable.data_type or 0), INTEGER_TYPES[kind]

@@ -1,9 +1,9 @@
-"""An EDS as makers write it, made readable: sections, and the corrections that they needed.
+"""Reads an EDS as makers write it: its sections, with corrections of its mistakes.
 
-CiA 306 says how an EDS is written; real ones have stray lines, other spellings of numbers and names, sections twice,
-lists that count wrong, sub-objects without their object. Nothing is invented here: what cannot be understood is left
-out, and each repair is listed. Of a section or a key that stands twice the first counts, as with the functions of
-Windows that most tools read an EDS with.
+CiA 306 defines the format of an EDS; real ones have stray lines, other spellings of numbers and names, duplicate
+sections, lists with wrong counts, sub-objects without their object. Nothing is invented here: unreadable entries are
+left out, and each repair is listed. Of duplicate sections or keys the first counts, as with the functions of Windows by
+which most tools read an EDS.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ SIGNED = {getattr(datatypes, f"INTEGER{bits}"): bits for bits in (8, 16, 24, 32,
 UNSIGNED = {getattr(datatypes, f"UNSIGNED{bits}"): bits for bits in (8, 16, 24, 32, 40, 48, 56, 64)}
 UNSIGNED |= {datatypes.BOOLEAN: 1}
 FLOATS = (datatypes.REAL32, datatypes.REAL64)
-USER_TYPES = 0x1B  # data types above are those of the file itself (CiA 301)
+USER_TYPES = 0x1B  # data types from here on are defined in the file itself (CiA 301)
 HEADERS = ("FileInfo", "DeviceInfo", "DeviceComissioning", "DummyUsage", "Comments", "MandatoryObjects",
            "OptionalObjects", "ManufacturerObjects")  # fmt: skip
 LISTS = HEADERS[-3:]
@@ -60,16 +60,16 @@ _MEMBER = re.compile(
 )
 _COMPACT = re.compile(r"([0-9A-Fa-f]{4})(Name|Value)$", re.IGNORECASE)
 
-MOST_ENTRIES = 20_000  # sections, those included that CompactSubObj stands for: no drive's file known has a tenth
+MOST_ENTRIES = 20_000  # sections, including those that CompactSubObj replaces: no known drive's file has a tenth of it
 MOST_SUB = 254  # highest sub-index (CiA 301)
 MOST_LINES = 300_000  # an entry has some ten
 LONGEST_NAME = 200  # letters of a section's name
-LONGEST_LINE = 1_000  # letters: CiA 306 has 255; each may stand again in 254 members, and in messages
+LONGEST_LINE = 1_000  # letters: CiA 306 allows 255; each may be repeated in 254 members, and in messages
 
-VALUE_KEYS = ("DataType", "AccessType", "DefaultValue", "LowLimit", "HighLimit", "PDOMapping")  # of what has a value
-MEMBER_KEYS = (*VALUE_KEYS, "ParameterValue", "ObjFlags", "Unit", "Factor", "Description")  # that an array hands down
+VALUE_KEYS = ("DataType", "AccessType", "DefaultValue", "LowLimit", "HighLimit", "PDOMapping")  # of entries with values
+MEMBER_KEYS = (*VALUE_KEYS, "ParameterValue", "ObjFlags", "Unit", "Factor", "Description")  # of members, too
 
-# What the standard's format of an object needs, least and greatest: CiA 301's COB-IDs, whose bit 31 switches a service
+# Least and greatest value that an object's standard format needs: CiA 301's COB-IDs, whose bit 31 switches a service
 # off and whose bit 30 makes a device produce SYNC, and watched node-IDs above their times in ms (1016h).
 FORMATS = (
     ((0x1005,), 0, (1, 0x400007FF)), ((0x1014,), 0, (1, 0x800007FF)), ((0x1016,), None, (0, 0x007FFFFF)),
@@ -81,14 +81,14 @@ Section = dict[str, str]
 
 
 class Repair(NamedTuple):
-    """A correction of a file: where (a section, or a line), and what was wrong."""
+    """A correction of a file: the place (a section, or a line), and the mistake."""
 
     where: str
     what: str
 
 
 class EdsFile(NamedTuple):
-    """An EDS: its sections in a clean order, every one as CiA 306 writes it, and the corrections."""
+    """An EDS: its sections in order, each in the format of CiA 306, and the corrections."""
 
     sections: dict[str, Section]
     repairs: tuple[Repair, ...]
@@ -107,7 +107,7 @@ def object_section(index: int, sub: int | None = None) -> str:
 
 
 def place_of(name: str) -> tuple[int, int] | None:
-    """Return index and sub-index of a section, sub-index -1 for an object as a whole; None for another section."""
+    """Return index and sub-index of a section, sub-index -1 for an object as a whole; None for other sections."""
     if len(name) > LONGEST_NAME:
         return None
     if found := _OBJECT.match(name):
@@ -118,7 +118,7 @@ def place_of(name: str) -> tuple[int, int] | None:
 
 
 def place_of_line(line: str) -> tuple[int, int] | None:
-    """Return the same for a line of a file, None for one that begins no section of an object."""
+    """Return index and sub-index of a line that begins an object's section; None for other lines."""
     found = _section_of(line)
     return None if found is None else place_of(found[0])
 
@@ -135,11 +135,11 @@ def parse_eds(text: str, node_id: int = 1) -> EdsFile:
     """Read an EDS and correct its mistakes.
 
     Args:
-        text: Of the file.
-        node_id: For sums with the node-ID that CiA 306 does not have.
+        text: The text of the file.
+        node_id: Replaces the node-ID in sums that CiA 306 does not allow.
 
     Raises:
-        UntrustedFileError: If it describes more than MOST_ENTRIES, or has more than MOST_LINES.
+        UntrustedFileError: If it has more than MOST_ENTRIES or MOST_LINES.
     """
     return _Repairer(text, node_id).file()
 
@@ -219,7 +219,7 @@ class _Repairer:
     def _take_value(self, section: Section, name: str, line: str, *, is_second: bool) -> None:
         mark = "=" if "=" in line else ":"
         key, value = (part.strip() for part in line.split(mark, 1))
-        value = re.sub(r"\s;.*$", "", " " + value).strip()  # python-canopen and most readers end a value so
+        value = re.sub(r"\s;.*$", "", " " + value).strip()  # python-canopen and most readers end a value there
         key = KEYS.get(key.replace(" ", "").lower(), key)
         if key != "ParameterName" and (cut := re.sub(r"\s//.*$", "", " " + value).strip()) != value:
             self._tell(f"[{name}]", f"a comment behind {key} was left out")
@@ -239,7 +239,7 @@ class _Repairer:
 
     # --- objects --------------------------------------------------------------------------------------------------
     def _expand_compact_objects(self) -> None:
-        """Write the members of an array that is described once (CompactSubObj) one by one."""
+        """Write out the members of an array that is described only once (CompactSubObj)."""
         for name in [name for name, row in self._sections.items() if "CompactSubObj" in row]:
             place, row = place_of(name), self._sections[name]
             text = row.pop("CompactSubObj")
@@ -264,7 +264,7 @@ class _Repairer:
             row["ObjectType"] = row.get("ObjectType", str(GROUPS[0]))
 
     def _add_missing_objects(self) -> None:
-        """Give sub-objects without an object one, and an object with sub-objects the type of such."""
+        """Add missing objects to sub-objects, and give objects with sub-objects a type that allows them."""
         members: dict[int, list[int]] = {}
         for name in self._sections:
             place = place_of(name)
@@ -290,7 +290,7 @@ class _Repairer:
             row["SubNumber"] = str(len(subs))
 
     def _move_value_to_sub_0(self, name: str, row: Section) -> None:
-        """Make the value of an object with sub-objects that of its sub-index 0, where CiA 301 has a value."""
+        """Move the value of an object with sub-objects to its sub-index 0, where CiA 301 has a value."""
         own = {key: row.pop(key) for key in VALUE_KEYS if key in row}
         self._sections[f"{name}sub0"] = {"ParameterName": row.get("ParameterName", "")} | own
         self._tell(f"[{name}]", "has a DataType beside its sub-objects: that of sub-index 0, which was added")
@@ -341,7 +341,7 @@ class _Repairer:
             row["DataType"] = f"0x{kind:04X}"
 
     def _missing_type(self, index: int, sub: int) -> int | None:
-        """Return the type that an entry can only have; None where nothing says it."""
+        """Return the only possible type of an entry; None if it cannot be inferred."""
         if sub == 0:
             return int(datatypes.UNSIGNED8)
         if index in STANDARD_TYPES:
@@ -403,7 +403,7 @@ class _Repairer:
             del row["LowLimit"], row["HighLimit"]
 
     def _check_format(self, name: str, row: Section) -> None:
-        """Leave out limits within which an object cannot have what the standard's format of it needs."""
+        """Remove limits that exclude values which the standard's format of the object needs."""
         index, sub = place_of(name) or (0, 0)
         of_sub, (least, greatest) = _FORMAT_OF.get(index, (-1, (0, 0)))
         is_it = max(sub, 0) == of_sub or (of_sub is None and sub > 0)
@@ -418,7 +418,7 @@ class _Repairer:
                 del row[key]
 
     def _drop_limits_of_zero(self) -> None:
-        """Take both limits 0 for none, where the file shows that its tool writes them so."""
+        """Remove limits that are both 0, if the file shows that its tool writes missing limits as 0."""
         zero = [row for row in self._sections.values() if row.get("LowLimit") == row.get("HighLimit") == "0"]
         if any(row.get("DefaultValue", "0") != "0" or row.get("PDOMapping") == "1" for row in zero):
             self._tell("the file", f"has both limits 0 at {len(zero)} objects: they are read as none")
@@ -463,7 +463,7 @@ class _Repairer:
                     row[key] = str(number)
 
     def _count(self, indices: list[int]) -> None:
-        """Write the lists of objects anew, and tell where they were wrong."""
+        """Write the lists of objects anew, and report wrong ones."""
         there = set(indices)
         for title in LISTS:
             listed = self._sections.get(title)
@@ -485,13 +485,13 @@ class _Repairer:
 
 
 def _is_known_sum(text: str) -> bool:
-    """Return whether a sum with the node-ID is written as CiA 306 allows: in either order, upper case."""
+    """Return whether a sum with the node-ID is written as CiA 306 allows: in either order, in upper case."""
     plain = re.sub(r"\s", "", text)
     return re.fullmatch(rf"(\{NODE_ID}(\+0x[0-9A-Fa-f]+|\+\d+)?|(0x[0-9A-Fa-f]+|\d+)\+\{NODE_ID})", plain) is not None
 
 
 def _in_range(number: int, bits: int, low: int, high: int) -> int | None:
-    """Return a number as its type has it; two's complement, and -1 for all bits, are understood."""
+    """Return a number in the range of its type, also from two's complement or -1 for all bits; None if out of range."""
     if low <= number <= high:
         return number
     if low < 0 and high < number < 1 << bits:

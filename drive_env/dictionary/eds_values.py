@@ -1,4 +1,4 @@
-"""Values of an EDS as makers write them: numbers, data types and access, whatever their spelling."""
+"""Parses values of an EDS in any spelling that makers use: numbers, data types and access."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _TERM = re.compile(r"([+-])?([^+-]+)")
 
 
 def number_of(text: str) -> int | None:
-    """Return the number that a text is, None for none: 0x20, 20h, &H20, 32, 032 (32), 32.0, 2F (hexadecimal), true."""
+    """Parse an integer: 0x20, 20h, &H20, 32, 032 (32), 32.0, 2F (hexadecimal), true. None for other text."""
     text = text.strip().strip('"').replace(" ", "")
     sign, text = (-1, text[1:]) if text.startswith("-") else (1, text.removeprefix("+"))
     if not 0 < len(text) <= LONGEST:
@@ -60,7 +60,7 @@ def is_plain(text: str) -> bool:
 
 
 def float_of(text: str) -> float | None:
-    """Return the real number that a text is, None for none: 25.5, 25,5 (one comma and no point), 1e-3."""
+    """Parse a real number: 25.5, 25,5 (one comma and no point), 1e-3. None for other text."""
     text = text.strip().strip('"').replace(" ", "")
     if text.count(",") == 1 and "." not in text:
         text = text.replace(",", ".")
@@ -73,26 +73,26 @@ def float_of(text: str) -> float | None:
 
 
 def is_plain_float(text: str) -> bool:
-    """Return whether a real number is written as python reads it: an optional point and exponent."""
+    """Return whether a real number is written as in Python: an optional point and exponent."""
     return re.fullmatch(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", text.strip()) is not None
 
 
 class NodeIdSum:
-    """A sum with the node-ID in it, as COB-IDs are written: `times` node-IDs and a number."""
+    """A sum of node-IDs and a number, as in COB-IDs: `times` node-IDs plus the number."""
 
     def __init__(self, times: int, number: int) -> None:
         self.times = times
         self.number = number
 
     def text(self, node_id: int) -> str:
-        """Return it as CiA 306 writes it; a sum that it does not have becomes the number of this node."""
+        """Return it in the format of CiA 306; a sum that CiA 306 does not allow becomes the number for this node."""
         if self.times == 1 and self.number >= 0:
             return f"{NODE_ID}+0x{self.number:X}"
         return f"0x{max(self.times * node_id + self.number, 0):X}"
 
 
 def node_id_sum(text: str) -> NodeIdSum | None:
-    """Parse a text with the node-ID as a sum; None for a text without it, or one that is not understood."""
+    """Parse a sum with the node-ID; None for a text without it, or an unreadable one."""
     plain = re.sub(r"\s", "", text).upper().strip("()")
     if "NODEID" not in plain or len(plain) > LONGEST or not re.fullmatch(r"[-+*$&0-9A-Z]+", plain):
         return None

@@ -22,11 +22,11 @@ from drive_env.dictionary.eds_file import EdsFile, parse_eds
 from drive_env.dictionary.roles import Role
 from mechanics.reading.untrusted import read_bytes
 
-# How callers name an object: index (sub-index 0), (index, sub-index), a role, or a name of CiA's; a sub-object's name
-# is "Object.Sub-object". Case does not matter.
+# How callers name an object: index (sub-index 0), (index, sub-index), a role, or CiA's name ("Object.Sub-object" for a
+# sub-object), in any case.
 ObjectName: TypeAlias = int | tuple[int, int] | str | Role
 ObjectNames: TypeAlias = ObjectName | Sequence[ObjectName]
-Rows: TypeAlias = Mapping[Any, ArrayLike] | None  # of values to play, one for each cycle, by the objects' names
+Rows: TypeAlias = Mapping[Any, ArrayLike] | None  # values to play, one for each cycle, by the objects' names
 
 # Width [bits], least and greatest value of each integer type of CiA 301.
 _WIDTHS = (8, 16, 24, 32, 40, 48, 56, 64)
@@ -39,9 +39,9 @@ INTEGER_TYPES = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Entry:
-    """One sub-index with all that the dictionary has of it. `bits`, `low`, `high` are None for a text.
+    """One sub-index with everything that the dictionary says of it. `bits`, `low`, `high` are None for a text.
 
-    A dictionary has one for each, which is equal to itself alone: tables by entry are looked up every millisecond.
+    Entries are compared by identity, since tables keyed by entry are looked up every millisecond.
     """
 
     index: int
@@ -64,7 +64,7 @@ class Entry:
 
 @dataclass(frozen=True, slots=True)
 class EdsText:
-    """An EDS that lies in no file: that of a variant is composed of its device's and a few rows."""
+    """An EDS without a file: a variant's is composed of its device's and a few rows."""
 
     name: str
     text: str
@@ -78,33 +78,33 @@ class EdsText:
 
 
 def read_eds(path: Path | EdsText, node_id: int = 1) -> canopen.ObjectDictionary:
-    """Return python-canopen's model of an EDS, put right first: real files are not as CiA 306 has them.
+    """Return python-canopen's model of an EDS, after correcting deviations from CiA 306.
 
-    It is read once: take a copy to change it.
+    The model is cached: copy it before changing it.
     """
     text, name = _source(path)
     return _model(text, name, node_id)
 
 
 def eds_file(path: Path | EdsText, node_id: int = 1) -> EdsFile:
-    """Return the content of an EDS, and the corrections that it needed.
+    """Return the content of an EDS, with the corrections that it needed.
 
-    A file that is not UTF-8 is read as cp1252, which many vendors' are; bytes that cp1252 lacks stand in names and
-    comments alone, where they are shown as unknown.
+    A file that is not UTF-8 is read as cp1252, which many vendors use; bytes that cp1252 lacks occur only in names and
+    comments, where they are shown as unknown.
     """
     return parse_eds(_source(path)[0], node_id)
 
 
 def eds_text(path: Path | EdsText) -> str:
-    """Return an EDS as it is written."""
+    """Return the text of an EDS, uncorrected."""
     return _source(path)[0]
 
 
 def written_objects(path: Path | EdsText, indices: Iterable[int]) -> dict[int, ODArray | ODRecord]:
-    """Return objects that an EDS has read only as those of a fieldbus that can write them, by index."""
+    """Return objects, by index, as writable ones that an EDS lists as read-only; for a fieldbus that can write them."""
     found = {}
     for index in indices:
-        item = found[index] = copy.copy(read_eds(path)[index])  # a deep copy has the whole dictionary, its parent
+        item = found[index] = copy.copy(read_eds(path)[index])  # a deep copy would include the whole dictionary
         members, item.subindices, item.names = list(item.values()), {}, {}
         for member in map(copy.copy, members):
             member.access_type = "rw"
@@ -113,11 +113,10 @@ def written_objects(path: Path | EdsText, indices: Iterable[int]) -> dict[int, O
 
 
 def _source(path: Path | EdsText) -> tuple[str, str]:
-    """Return an EDS's text and where it is from."""
     return (path.text, path.name) if isinstance(path, EdsText) else (_read_text(path), str(path))
 
 
-@lru_cache(maxsize=16)  # of 0.1 to 1 s, for every set of drives and every connection to one
+@lru_cache(maxsize=16)  # 0.1 to 1 s each, for every set of drives and every connection
 def _model(text: str, name: str, node_id: int) -> canopen.ObjectDictionary:
     source = io.StringIO(parse_eds(text, node_id).text())
     source.name = name if name.lower().endswith((".eds", ".dcf")) else f"{name}.eds"
@@ -135,7 +134,7 @@ def _read_text(path: Path) -> str:
 
 
 def _content(variable: ODVariable) -> str:
-    """Return the factory's content of a text, a domain or a float; of those each byte is a character."""
+    """Return the factory value of a text, domain or float; each byte of text and domain is a character."""
     if variable.data_type in datatypes.FLOAT_TYPES:
         content = struct.pack("<f" if variable.data_type == datatypes.REAL32 else "<d", float(variable.default or 0.0))
         return content.decode("latin-1")
@@ -144,7 +143,7 @@ def _content(variable: ODVariable) -> str:
 
 @lru_cache(maxsize=32)
 def _entries(text: str, name: str, node_id: int) -> tuple[dict[tuple[int, int], Entry], dict[str, tuple[int, int]]]:
-    """Return the entries of an EDS, and where each name is."""
+    """Return the entries of an EDS, and the key of each name."""
     found = [entry for item in _model(text, name, node_id).values() for entry in _entries_of(item)]
     entries = {(entry.index, entry.sub): entry for entry in found}
     return entries, {entry.name.casefold(): (entry.index, entry.sub) for entry in found}
@@ -188,7 +187,7 @@ def _entry(variable: ODVariable, name: str) -> Entry:
 
 
 def _as_key(name: str) -> tuple[int, int] | None:
-    """Return index and sub-index of "6081:0", as the files of a device write them; None for another text."""
+    """Parse "6081:0", as in the files of a device, to index and sub-index; None for other text."""
     index, colon, sub = name.partition(":")
     is_key = bool(colon) and len(index) == 4 and all(letter in "0123456789abcdefABCDEF" for letter in index)
     return (int(index, 16), int(sub)) if is_key and sub.isdecimal() else None
@@ -199,9 +198,9 @@ class ObjectDictionary:
 
     Args:
         path: The EDS.
-        node_id: For defaults that depend on it.
-        roles: Which object plays which part.
-        moved: Name or index ("23C5") of an object that the device had once -> what it has instead, for messages.
+        node_id: Node-ID for defaults that contain it.
+        roles: Role -> its object.
+        moved: Name or index ("23C5") of a former object -> its replacement, for messages.
     """
 
     def __init__(
@@ -223,10 +222,10 @@ class ObjectDictionary:
         return len(self._entries)
 
     def has(self, name: ObjectName) -> bool:
-        """Return whether there is such an object, or one that plays such a part."""
+        """Return whether the dictionary has an object of that name or role."""
         if isinstance(name, int):
             name = name, 0
-        if type(name) is tuple and len(name) == 2:  # an error's message looks through all of them
+        if type(name) is tuple and len(name) == 2:  # the message of an error tries all of them
             return name in self._entries
         try:
             self.find(name)
@@ -279,7 +278,7 @@ class ObjectDictionary:
         return f"; earlier versions had it: write {to}" if to else ""
 
     def only(self, has: Callable[[int, str], bool]) -> ObjectDictionary:
-        """Return the dictionary of the objects for whose index and name `has` is true."""
+        """Return the dictionary of only the objects for whose index and name `has` is true."""
         return self._with({key: one for key, one in self._entries.items() if has(one.index, one.name)})
 
     def including(self, items: Iterable[ODArray | ODRecord]) -> ObjectDictionary:

@@ -1,4 +1,4 @@
-"""Homing methods (6098h): what each does, in words."""
+"""Homing methods (6098h): their descriptions."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from typing import Any, NamedTuple
 
 from mechanics.reading.untrusted import read_toml
 
-WITHOUT_INDEX = 16  # from a method with an index to the one that ends at the switch's edge
-HERE = (35, 37)  # which move nothing
-INDEX_ALONE = (33, 34)  # which search no switch
+WITHOUT_INDEX = 16  # offset from a method with an index to the one that ends at the switch's edge
+HERE = (35, 37)  # methods without movement
+INDEX_ALONE = (33, 34)  # methods that search no switch
 _DATA = read_toml(Path(__file__).parent / "homing_methods.toml")
 _EDGES = {int(number): text for number, text in _DATA["standard"].items()}
-# CiA 402's, by number: what each does.
+# CiA 402's methods by number, with their descriptions.
 METHODS: dict[int, str] = {
     **{n: _EDGES[n + WITHOUT_INDEX] + _DATA["then_to_the_index"] for n in range(1, 15)},
     **_EDGES,
@@ -21,11 +21,11 @@ TO_INDEX = 10.0  # of a sketch's 100, from an edge to the next index
 
 
 class HomingSketch(NamedTuple):
-    """How a method goes along an axis from 0 (left) to 100.
+    """The way of a method along an axis from 0 (left) to 100.
 
     Attributes:
-        switch: Which is searched: "left" and "right" limit switch, "home" switch, "" for none.
-        way: From where the axis stands, by the places where it turns, to home.
+        switch: The switch that it searches: "left" and "right" limit switch, "home" switch, "" for none.
+        way: Start, turning points and home.
         has_index: Whether home is an index of the encoder.
     """
 
@@ -52,10 +52,11 @@ _OWN = {int(number): text for number, text in _DATA["known_devices"].items()}
 
 
 def method_text(method: int, *, is_known: bool) -> str:
-    """Return the description of a homing method, or that the manual has one.
+    """Return the description of a homing method, or a reference to the manual.
 
     Args:
-        method: As 6098h has it.
-        is_known: Whether the device is known: of others a negative number, the maker's own, may mean anything.
+        method: Number in 6098h.
+        is_known: Whether the device is known: negative numbers, which are the maker's own, have no known meaning
+            otherwise.
     """
     return (METHODS | _OWN if is_known else METHODS).get(method, "the maker's own: the drive's manual describes it")

@@ -1,8 +1,8 @@
 """Objects that show a part of another object, of the same axis or of a certain axis of the node.
 
-A device's table `parts` has them: `of`, the object, or one for each axis of the node; `axis`, whose; `shift` and
-`bits`, which part of it: bits from `shift` on, taken as a signed number with `signed`; or a `share` of its number, the
-first over the second; or another number for each of its own, by `table`.
+Their rows in a device's table `parts`: `of` is the whole object, or one for each axis of the node, `axis` the axis; the
+part is `bits` from `shift` on, as a signed number with `signed`; or a `share` of the number (first over second); or a
+number looked up in `table`.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ class Part(NamedTuple):
 
     Attributes:
         of: The object, or one for each axis of the node.
-        axis: Number in the node of the axis whose object it is; None: of the same axis.
+        axis: Number in the node of the whole object's axis; None: the same axis.
         shift: Lowest of its bits.
-        bits: How many of them.
-        signed: Whether their highest one is a sign.
-        table: Pairs of a number of the whole and what is shown for it, instead of bits.
-        share: Numerator and divisor of what is shown of the whole number instead; (0, 1) shows bits.
+        bits: Number of bits.
+        signed: Whether the highest bit is a sign.
+        table: Pairs of a whole number and the number shown for it, instead of bits.
+        share: Numerator and divisor of the share shown of the whole number instead; (0, 1) shows bits.
     """
 
     of: tuple[Key, ...]
@@ -35,11 +35,11 @@ class Part(NamedTuple):
     table: tuple[tuple[int, int], ...] = ()
 
     def source(self, axis: int) -> Key:
-        """Return the object that an axis of the node shows a part of."""
+        """Return the whole object of a part that an axis of the node shows."""
         return self.of[axis % len(self.of)]
 
     def shown(self, raw: Any) -> Any:
-        """Return the part of integers of the object."""
+        """Return the part of the whole object's integers."""
         if self.table:
             return sum((raw == whole) * shown for whole, shown in self.table)
         numerator, divisor = self.share
@@ -49,7 +49,7 @@ class Part(NamedTuple):
         return found - ((found >> (self.bits - 1)) << self.bits) if self.signed else found
 
     def put(self, raw: Any, part: Any) -> Any:
-        """Return integers of the object with another part."""
+        """Return the whole object's integers with another part."""
         if self.table:
             return sum((part == shown) * whole for whole, shown in self.table)
         mask = ((1 << self.bits) - 1) << self.shift
@@ -58,7 +58,7 @@ class Part(NamedTuple):
 
 
 def parts_of(rows: Mapping[Key, Mapping[str, Any]], parse: Any) -> dict[Key, Part]:
-    """Return a device's table; `parse` makes a key of its text."""
+    """Return a device's table; `parse` makes a key of a text."""
     return {
         key: Part(tuple(parse(text) for text in row["of"]), **{k: v for k, v in row.items() if k != "of"})
         for key, row in rows.items()

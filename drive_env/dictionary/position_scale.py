@@ -1,8 +1,8 @@
-"""How many increments of position a revolution has: one object says it, or two whose values make it.
+"""Position increments per revolution: the value of one object, or computed from several.
 
-A servo drive has an object of its own for it (Role.POSITION_SCALE). A stepper counts microsteps: full steps of a turn,
-times two to the power of the resolution. Of CiA 402 are the encoder's resolution (608Fh), and feed constant over gear
-ratio (6092h, 6091h), each a fraction of two objects.
+Servo drives have one object for it (Role.POSITION_SCALE). Steppers count microsteps: full steps per revolution times
+two to the power of the resolution. CiA 402 has the encoder's resolution (608Fh), and feed constant over gear ratio
+(6092h, 6091h), each a fraction of two objects.
 """
 
 from __future__ import annotations
@@ -16,20 +16,21 @@ from drive_env.cia402 import Key
 from drive_env.dictionary.roles import Role
 from mechanics.arrays import Floats
 
-# Units of position in a turn: by fewer no position could be held, and of more 32 bits hold fewer than 8 turns.
+# Allowed position units per revolution: with fewer no position could be held, with more 32 bits hold fewer than 8
+# turns.
 COARSEST, FINEST = 100.0, float(2**28)
-TURN_INSIDE = 2.0**32  # increments of a revolution, of drives whose positions inside have 64 bits
+TURN_INSIDE = 2.0**32  # increments per revolution of drives with internal positions of 64 bits
 
 
 class PositionScale(NamedTuple):
-    """The objects of a scale, and a function of their values: the increments of a revolution, of any shape."""
+    """The objects of a scale, and the function from their values to increments per revolution, of any shape."""
 
     keys: tuple[Key, ...]
     increments: Callable[[Sequence[Floats]], Floats]
 
 
 def position_scale(roles: Mapping[Role, Key]) -> PositionScale | None:
-    """Return the scale of positions of a drive with these roles; None if it has none of the roles."""
+    """Return the position scale of a drive with these roles; None if it has none of the roles."""
     if Role.POSITION_SCALE in roles:
         return PositionScale((roles[Role.POSITION_SCALE],), lambda values: values[0])
     inside = (Role.POSITION_NUMERATOR, Role.POSITION_DIVISOR)
@@ -44,7 +45,7 @@ def position_scale(roles: Mapping[Role, Key]) -> PositionScale | None:
 
 
 def is_scale(units: float) -> bool:
-    """Return whether positions can be counted in so many units a turn."""
+    """Return whether positions can be counted in this number of units per revolution."""
     return COARSEST <= units <= FINEST
 
 
@@ -64,12 +65,12 @@ def _per_motor_turn(values: Sequence[Floats]) -> Floats:
 
 
 def velocity_ratio(roles: Mapping[Role, Key]) -> PositionScale | None:
-    """Return the objects of the rpm of a velocity unit, and the function of their values; None for other drives."""
+    """Return the objects that give the rpm of a velocity unit, with the function of their values; or None."""
     return _ratio(roles, (Role.VELOCITY_NUMERATOR, Role.VELOCITY_DIVISOR))
 
 
 def set_point_ratio(roles: Mapping[Role, Key]) -> PositionScale | None:
-    """Return the same of the velocity units of a target velocity of vl (604Bh)."""
+    """Return the same for the velocity units of a target velocity of vl (604Bh)."""
     return _ratio(roles, (Role.SET_POINT_NUMERATOR, Role.SET_POINT_DIVISOR))
 
 

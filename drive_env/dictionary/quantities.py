@@ -1,7 +1,7 @@
-"""Quantities as people write them: `1000 rpm`, `7 A`, `0.5 rev`; and the integers that a drive has instead.
+"""Quantities as people write them (`1000 rpm`, `7 A`, `0.5 rev`), and the drive's integers for them.
 
 The EDS names the unit of each object (`Entry.unit`). Most drives count positions and speeds in increments of a
-revolution; some have a unit of velocity of their own (6094h), or tell torques in parts of the motor's peak current.
+revolution; some have a unit of velocity of their own (6094h), or give torques relative to the motor's peak current.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class AxisScale(NamedTuple):
     set_point: float | None = None
 
 
-# What units of an axis follow; of most drives that is the increments of a revolution alone. None: nothing is known.
+# The scales that the units of an axis follow: for most drives only the increments per revolution. None: unknown.
 Scale = AxisScale | float | None
 
 UNITS = {
@@ -70,10 +70,10 @@ UNITS = {
     "100us": EnteredUnit("time", 1e-4),
     "us": EnteredUnit("time", 1e-6),
 }
-# Units that follow the increments of a revolution, the rpm of a velocity unit, a current of the motor.
+# Units that follow increments per revolution, rpm of a velocity unit, or a current of the motor.
 _INCREMENTAL = {"inc": "angle", "pps": "speed", "pps^2": "acceleration"}
 _BY_RATIO = {"velocity unit": "rpm", "velocity unit/s": "rpm/s", "set-point unit": "rpm"}
-# Field of the scale that a current is a part of, and the part.
+# Field of the scale that a current is relative to, and its fraction.
 _OF_CURRENT = {"1/32767 M-Ipeak": ("peak_current", 1.0 / 32767.0), "1/1000 of M-Inull": ("nominal_current", 1e-3)}
 SHOWN = {"angle": "rev", "speed": "rpm", "acceleration": "rev/s^2", "current": "A", "voltage": "V", "time": "s"}
 CHARACTERS = "chars"  # four of a text, the first one in the lowest byte
@@ -81,7 +81,7 @@ _QUANTITY = re.compile(r"^\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\S.*
 
 
 def find_unit(name: str, scale: Scale) -> EnteredUnit | None:
-    """Return a unit by name, None for an unknown unit, or one whose scale is not known."""
+    """Return a unit by name; None for an unknown unit, or one with an unknown scale."""
     known = scale if isinstance(scale, AxisScale) else AxisScale(scale)
     if name in _INCREMENTAL:
         return EnteredUnit(_INCREMENTAL[name], 1.0 / known.increments) if known.increments else None
@@ -101,12 +101,12 @@ def find_unit(name: str, scale: Scale) -> EnteredUnit | None:
 
 
 def follows_scale(name: str) -> bool:
-    """Return whether a unit follows a scale of its axis, which a drive is to be asked for then."""
+    """Return whether a unit follows a scale of its axis, which must then be read from the drive."""
     return split_unit(name)[1] in (*_INCREMENTAL, *_BY_RATIO, *_OF_CURRENT)
 
 
 def scales_of(drives: AxisObjects, known: ObjectDictionary) -> list[Scale]:
-    """Return the scale of every axis' units, as far as the drive tells it.
+    """Return the scale of every axis' units, as far as the drive reports it.
 
     Args:
         drives: Emulated, or on a bus.
@@ -129,7 +129,7 @@ def scales_of(drives: AxisObjects, known: ObjectDictionary) -> list[Scale]:
 
 
 def _increments_of(drives: AxisObjects, known: ObjectDictionary) -> list[float | None]:
-    """Return the position increments of a revolution of every axis, None where the drive does not say."""
+    """Return the position increments per revolution of every axis; None if the drive does not report them."""
     encoder = (cia402.ENCODER_RESOLUTION, 1)
     own = position_scale(known.roles) is not None
     if not own and not known.has(encoder):
@@ -141,14 +141,14 @@ def parse(text: str, entry: Entry, scale: Scale) -> int:
     """Return the integer for an object that is written as text: a plain integer (also 0x...), or a quantity.
 
     Args:
-        text: What was written.
+        text: The text.
         entry: The object.
-        scale: What the axis' units follow.
+        scale: The scale of the axis' units.
 
     Raises:
-        ValueError: For what is not a number, or a unit that does not fit the object.
+        ValueError: For text without a number, or a unit that does not fit the object.
 
-    An object of four characters of a text takes these, filled up with blanks; in quotation marks digits are characters.
+    For an object of four characters of text the text is padded with blanks; in quotation marks digits are characters.
     """
     try:
         return int(text, 0)
@@ -186,7 +186,7 @@ def _characters(text: str, entry: Entry) -> int:
 
 
 def is_quantity(value: object) -> bool:
-    """Return whether a value is a text of a number and a unit."""
+    """Return whether a value is text with a number and a unit."""
     if not isinstance(value, str) or re.fullmatch(r"\s*0[xob]\w+\s*", value, re.IGNORECASE):
         return False
     found = _QUANTITY.match(value)
@@ -194,13 +194,13 @@ def is_quantity(value: object) -> bool:
 
 
 def integers(text: str, entry: Entry, scale: Sequence[Scale], where: Mask | None = None) -> Integers:
-    """Return the integer of each axis for an object that is written as a quantity, 0 where the mask is not true.
+    """Return the integer of each axis for an object written as a quantity; 0 where the mask is false.
 
     Args:
-        text: As `parse` takes it.
+        text: As for `parse`.
         entry: The object.
-        scale: What the units of each axis follow.
-        where: Axes.
+        scale: The scale of each axis' units.
+        where: The mask of axes; None: all.
 
     Raises:
         ValueError: As `parse` does.
@@ -213,10 +213,10 @@ def in_unit(raw: Integers, entry: Entry, unit: str, scale: Sequence[Scale]) -> F
     """Return integers of an object in a unit, of the same shape; axes are the last dimension.
 
     Args:
-        raw: As the wire carries them.
+        raw: Integers on the bus.
         entry: The object.
-        unit: A row of the units, or the object's own.
-        scale: What the units of each axis follow.
+        unit: A unit of the table, or the object's own.
+        scale: The scale of each axis' units.
 
     Raises:
         ValueError: For a unit that does not fit the object.
@@ -227,7 +227,7 @@ def in_unit(raw: Integers, entry: Entry, unit: str, scale: Sequence[Scale]) -> F
 
 
 def _factor(entry: Entry, name: str, scale: Scale) -> float:
-    """Return how many of a unit one count of an object is."""
+    """Return one count of an object in a unit."""
     own, given = find_unit(entry.unit, scale), find_unit(name, scale)
     if own is None:
         raise ValueError(f"{entry.label} has no unit that {name} could be turned into; give its integer")
@@ -238,7 +238,7 @@ def _factor(entry: Entry, name: str, scale: Scale) -> float:
 
 
 def parse_raw(text: str, entry: Entry) -> int:
-    """Return an integer that is written as such; ValueError for anything else."""
+    """Parse a plain integer; ValueError for other text."""
     try:
         return int(text, 0)
     except ValueError:
@@ -248,7 +248,7 @@ def parse_raw(text: str, entry: Entry) -> int:
 
 
 def show(raw: int, entry: Entry, scale: Scale) -> str:
-    """Return an integer with its unit and, where that helps, as a quantity or text: `1092267 pps (1000 rpm)`."""
+    """Return an integer with its unit and, if useful, as a quantity or text: `1092267 pps (1000 rpm)`."""
     text = f"{raw} {entry.unit}".rstrip()
     if entry.unit == CHARACTERS:
         return f"{text} ({raw.to_bytes((raw.bit_length() + 7) // 8, 'little').decode('latin-1')!r})"

@@ -1,7 +1,7 @@
-"""Roles: the parts that objects play on a drive, whatever their index; a device's `roles.toml` says which object does.
+"""Roles: functions of objects on a drive, independent of their index; a device's `roles.toml` names the object of each.
 
-A role is a name for an object wherever an object is named: `drives.read(Role.CURRENT_LIMIT)`. `device.roles` has those
-of a device; to read or write another one is an error that names the role.
+A role can be used wherever an object is named: `drives.read(Role.CURRENT_LIMIT)`. `device.roles` has those of a device;
+access by another role is an error that names it.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from drive_env import cia402
 
 
 class Role(Enum):
-    """A part that an object plays; the value is its name in messages."""
+    """A function of an object; the value is its name in messages."""
 
     POSITION_SCALE = "scale of positions (increments of a revolution)"
     ENCODER_INCREMENTS = "increments of the encoder"
@@ -80,7 +80,7 @@ class Role(Enum):
     ANALOG_INPUTS = "analog inputs"
 
 
-# Of CiA 402's drives with vl that have them: velocities are rpm times 604Ch, and targets of vl times 604Bh, too.
+# Of CiA 402's drives with vl: velocities are rpm times 604Ch, and targets of vl also times 604Bh.
 VL_FACTORS = {
     Role.VELOCITY_NUMERATOR: (cia402.VL_DIMENSION_FACTOR, 1),
     Role.VELOCITY_DIVISOR: (cia402.VL_DIMENSION_FACTOR, 2),

@@ -15,12 +15,12 @@ AREAS = {
 
 
 def area_of(index: int) -> str:
-    """Return in which area of the dictionary an object is."""
+    """Return the area of the dictionary that an index belongs to."""
     return next((name for name, (_, area) in AREAS.items() if index in area), "communication")
 
 
 def searched(entries: Iterable[Entry], text: str) -> list[Entry]:
-    """Return the entries whose index, name or unit have all words of a text; all for none."""
+    """Return the entries whose index, name or unit contain all words of a text; all entries for an empty text."""
     words = [word.removeprefix("0x") for word in text.lower().replace("h:", ":").split()]
     found = []
     for entry in entries:

@@ -1,4 +1,4 @@
-"""What the standards say of objects: types and access, for an EDS that leaves them out; which are no parameters."""
+"""Types and access of standard objects, for an EDS that omits them, and the objects that are not parameters."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ STANDARD_TYPES: dict[int, tuple[int, str]] = {
     cia402.SUPPORTED_MODES: (U32, "ro"),
 }
 
-# What can be written but is no parameter, by CiA 301 and 402; a device's own are in its data.
+# Writable objects of CiA 301 and 402 that are not parameters; a device's own are in its data.
 COMMANDS = {
     0x1003: "error history: a service",
     0x1010: "store: a service",

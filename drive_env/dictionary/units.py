@@ -1,7 +1,7 @@
 """Drive units to SI and back: the only border between the two.
 
-A unit is a factor, SI per drive unit, that may differ from axis to axis (positions follow their scale), and what it
-has besides. `codec.py` converts.
+A unit is a factor, SI per drive unit, which may differ from axis to axis (positions follow their scale), and further
+properties. `codec.py` converts.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ class Context(NamedTuple):
 
     position_scaler: Any  # [inc/rev]
     current_lsb: float  # [A] per LSB of the current loop
-    rated_current: float = math.nan  # [A] of peak i_q, the base of CiA 402's thousandths
+    rated_current: float = math.nan  # [A] of peak i_q, to which CiA 402's thousandths refer
     velocity_ratio: Any = 1.0  # rpm of a velocity unit (6094h, or 604Ch)
     set_point_ratio: Any = 1.0  # velocity units of a target velocity of vl (604Bh)
-    peak_current: Any = math.nan  # of the motor [A], of which torques are parts
-    nominal_motor_current: Any = math.nan  # of the motor [A], of whose thousandths torques are on some drives
-    profile_bits: Any = 16.0  # of a revolution's increments of a profile generator, as a power of two
+    peak_current: Any = math.nan  # of the motor [A], to which torques refer
+    nominal_motor_current: Any = math.nan  # of the motor [A], to whose thousandths torques refer on some drives
+    profile_bits: Any = 16.0  # increments of a profile generator per revolution, as a power of two
 
 
 class Unit(NamedTuple):
     """A row: name, quantity, and SI per drive unit.
 
     Attributes:
-        period: Number of integers of a counter that goes on past the end of its type; 0 for one that saturates.
-        specials: Integers that stand for an SI value which the factor does not give, with that value.
-        follows_scale: Whether the factor follows a scale, of positions, velocities or torques: what is stored in such a
-            unit is kept in raw integers when a scale changes.
+        period: Number of integers of a counter that wraps at the end of its type; 0 for one that saturates.
+        specials: Integers with an SI value that does not follow from the factor, and that value.
+        follows_scale: Whether the factor follows a scale of positions, velocities or torques: stored values keep their
+            raw integers when that scale changes.
     """
 
     name: str
@@ -155,7 +155,7 @@ UNITS: dict[str, Unit] = {
 
 
 def split_unit(name: str) -> tuple[float, str]:
-    """Split a unit into a number and a base: "0.1 rpm" is 0.1 of "rpm", and a row of the table 1 of itself."""
+    """Split a unit into a factor and a base: "0.1 rpm" into 0.1 and "rpm", a plain unit into 1 and itself."""
     number, _, base = name.partition(" ")
     if name in UNITS or base not in UNITS:
         return 1.0, name
@@ -167,10 +167,10 @@ def split_unit(name: str) -> tuple[float, str]:
 
 @cache
 def find_unit(name: str) -> Unit:
-    """Return a row by its name, or so many of one: "0.1 rpm", "10 pps^2".
+    """Return a unit by its name, or a multiple of one: "0.1 rpm", "10 pps^2".
 
     Raises:
-        ValueError: For a unit that there is not, with a near one.
+        ValueError: For an unknown unit, with a similar name.
     """
     if name in UNITS:
         return UNITS[name]

@@ -14,14 +14,14 @@ if TYPE_CHECKING:
     from drive_env.dictionary.entries import ObjectName
 
 
-LONGEST = 1e7  # s, that any one call, wait or recording may last: 115 days
+LONGEST = 1e7  # s, the longest call, wait or recording: 115 days
 
 
 def checked_mask(where: Mask | None, count: int) -> Mask:
-    """Return which of so many axes or machines are meant, all of them by default.
+    """Return the mask of the chosen axes or machines, of `count` in all; all of them by default.
 
     Raises:
-        ValueError: If it is no boolean array of that length.
+        ValueError: If it is not a boolean array of that length.
     """
     if where is None:
         return np.ones(count, bool)
@@ -35,7 +35,7 @@ def whole_cycles(duration: float, cycle: float) -> int:
     """Return how many communication cycles [s] fill a duration [s].
 
     Raises:
-        ValueError: If no whole number of them does.
+        ValueError: If it is not a whole number of cycles.
     """
     if not 0.0 <= duration <= LONGEST:
         raise ValueError(
@@ -50,5 +50,5 @@ def whole_cycles(duration: float, cycle: float) -> int:
 
 
 def object_names(objects: ObjectName | Sequence[ObjectName]) -> tuple[ObjectName, ...]:
-    """Return the objects that are meant: one by its name or index alone, or several; two integers are two indices."""
+    """Return the objects as a tuple: one by its name or index alone, or several; two integers are two indices."""
     return (objects,) if isinstance(objects, str | int | np.integer | Role) else tuple(objects)

@@ -1,8 +1,8 @@
-"""Chosen axes of some drives as drives of their own: the others are never commanded, and their parameters stay.
+"""Chosen axes of some drives as separate drives: the others are never commanded, and their parameters stay.
 
-A module may have more axes than motors. What is done to all axes of such drives is done to the chosen ones; each keeps
-its number (`axis_numbers`), by which results and errors call it. On a bus, process data are still those of whole nodes:
-where rows are played, the axes left out get the value that they have.
+A module may have more axes than motors. An operation on all axes of such drives acts on the chosen ones; each keeps its
+number (`axis_numbers`) in results and errors. On a bus, process data are still those of whole nodes: when rows are
+played, the other axes get their present values.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ def chosen_parts(axes: Iterable[int], count: int, name: str) -> tuple[int, ...]:
 
     Args:
         axes: Their numbers, from 0.
-        count: How many a module has.
+        count: Number of axes of a module.
         name: Their name, for the message.
 
     Raises:
-        ValueError: For an axis that it does not have, or none at all.
+        ValueError: For an axis that it does not have, or an empty choice.
     """
     chosen = tuple(sorted(set(axes)))
     for axis in chosen:
@@ -54,7 +54,7 @@ class ChosenAxes(DrivesProxy):
 
     Args:
         drives: The drives; they are closed with these.
-        axes: Which of their axes, rising.
+        axes: Numbers of the chosen axes, ascending.
 
     Raises:
         ValueError: For an axis that they do not have.
@@ -64,7 +64,7 @@ class ChosenAxes(DrivesProxy):
         super().__init__(drives)
         self._axes = np.array(chosen_parts(axes, drives.num_axes, "set of drives"), np.int64)
         self._numbers = tuple(drives.axis_numbers[k] for k in self._axes)
-        self._others: dict[ObjectName, Integers] = {}  # what axes left out have of objects that are played
+        self._others: dict[ObjectName, Integers] = {}  # present values of the other axes for played objects
         self._safety: ChosenWatch | None = None
         if drives.safety is not None:
             left_out = set(range(drives.num_axes)) - set(self._axes.tolist())
@@ -78,23 +78,23 @@ class ChosenAxes(DrivesProxy):
 
     @property
     def axis_numbers(self) -> Sequence[int]:
-        """What each chosen axis is called."""
+        """Number of each chosen axis."""
         return self._numbers
 
     @property
     def machine(self) -> None:
-        """None: the emulated machine moves by all of its axes, and is the others', too."""
+        """None: the emulated machine belongs to the other axes, too, and moves with all of them."""
         return None
 
     @property
     def safety(self) -> SafetyWatch | None:
-        """What watches over drives that may be real; limits are those of the chosen axes."""
+        """The watch over drives that may be real, with limits of the chosen axes; None without one."""
         return self._safety
 
     def read(self, name: ObjectName) -> Integers:
         """Return an object of every chosen axis."""
         bus = self._drives.bus
-        if bus is not None and bus is self._drives:  # an SDO each: those of the others would only take time
+        if bus is not None and bus is self._drives:  # one SDO each: reading the others would only take time
             return bus.read_of(name, self._axes.tolist())
         return np.asarray(self._drives.read(name)[self._axes])
 
@@ -108,7 +108,7 @@ class ChosenAxes(DrivesProxy):
         given = np.asarray(value)
         if given.shape != (self.num_axes,):
             raise ValueError(f"{given.shape} values are given for {self.num_axes} axes; give one for all, or one each")
-        whole = np.full(self._drives.num_axes, given[0], given.dtype)  # what an axis left out has here is not written
+        whole = np.full(self._drives.num_axes, given[0], given.dtype)  # values for the other axes are not written
         whole[self._axes] = given
         self._drives.write(name, whole, where=mask)
 
@@ -118,7 +118,7 @@ class ChosenAxes(DrivesProxy):
         return self._drives.record(objects, duration, rows or None, period).of_axes(self._axes.tolist())
 
     def _rows(self, name: ObjectName, values: Integers) -> Integers:
-        """Return rows for all axes: those left out keep their values."""
+        """Return rows for all axes, with present values for the axes that are not chosen."""
         if name not in self._others:
             self._others[name] = np.asarray(self._drives.read(name))
         whole = np.tile(self._others[name], (len(values), 1))
@@ -126,7 +126,7 @@ class ChosenAxes(DrivesProxy):
         return whole
 
     def emergencies(self) -> list[EmergencyMessage]:
-        """Return the emergencies of the chosen axes since the last call, by their place among these."""
+        """Return the chosen axes' emergencies since the last call, by their position among these."""
         place = {int(axis): k for k, axis in enumerate(self._axes)}
         told = self._drives.emergencies()
         return [message._replace(axis=place[message.axis]) for message in told if message.axis in place]
@@ -137,12 +137,12 @@ class ChosenAxes(DrivesProxy):
 
 
 class ChosenWatch:
-    """The watch over drives, with limits of the chosen axes; axes left out have their drives' own.
+    """The watch over drives with limits of the chosen axes; the others have their drives' own limits.
 
     Args:
         whole: The watch over all axes.
         axes: The chosen ones.
-        count: How many there are.
+        count: Number of all axes.
     """
 
     def __init__(self, whole: SafetyWatch, axes: Integers, count: int) -> None:
@@ -153,7 +153,7 @@ class ChosenWatch:
 
     @property
     def limits(self) -> Limits:
-        """What the program may do to the chosen axes."""
+        """The program's limits for the chosen axes."""
         return self._limits
 
     @limits.setter
@@ -162,13 +162,13 @@ class ChosenWatch:
         self._limits = limits
 
     def change(self, limits: Limits) -> None:
-        """Take other limits of the chosen axes."""
+        """Replace the limits of the chosen axes."""
         limits.check_axes(len(self._axes))
         self._whole.change(self._of_all(limits))
         self._limits = limits
 
     def leave_alone(self, axes: Iterable[int]) -> None:
-        """Take note of axes that the program never moves, by their numbers among all."""
+        """Note axes that the program never moves, by their numbers among all."""
         self._whole.leave_alone(axes)
 
     def watched(self) -> list[Entry]:
@@ -176,19 +176,19 @@ class ChosenWatch:
         return self._whole.watched()
 
     def stop(self, reason: str) -> None:
-        """Bring what is live to rest and switch it off."""
+        """Bring live axes to rest and switch them off."""
         self._whole.stop(reason)
 
     def stop_at_once(self, reason: str) -> None:
-        """Have what is live quick-stopped, from any thread."""
+        """Have live axes quick-stopped; callable from any thread."""
         self._whole.stop_at_once(reason)
 
     def _chosen(self, limits: Limits) -> Limits:
-        """Return limits of all axes as those of the chosen ones."""
+        """Select the chosen axes' limits from those of all axes."""
         return _each(limits, lambda value: [value[axis] for axis in self._axes])
 
     def _of_all(self, limits: Limits) -> Limits:
-        """Return limits of the chosen axes as those of all."""
+        """Extend limits of the chosen axes to all axes."""
 
         def spread(value: Sequence[float | None]) -> list[float | None]:
             whole: list[float | None] = [None] * self._count
@@ -208,7 +208,7 @@ class ChosenWatch:
 
 
 def _each(limits: Limits, chosen: Any) -> Limits:
-    """Return limits with those that are given for each axis replaced."""
+    """Return limits in which each value per axis is replaced by the function `chosen`."""
 
     def of(value: Any) -> Any:
         return value if value is None or np.ndim(value) == 0 else chosen(value)

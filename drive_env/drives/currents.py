@@ -1,4 +1,4 @@
-"""How drives count torques and limit currents: in milliamperes, or in parts of the motor's peak or nominal current."""
+"""Units of torques and current limits: milliamperes, or relative to the motor's peak or nominal current."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _WHOLE = 32767.0
 def ampere_per_count(drives: Drives) -> Floats | float:
     """Return the amperes of a count of 6071h and 6077h, one or shape (num_axes,).
 
-    A drive that is known by its EDS alone is taken to count milliamperes.
+    For a drive known only by its EDS milliamperes are assumed.
 
     Args:
         drives: Emulated, or on a bus.
@@ -34,18 +34,18 @@ def ampere_per_count(drives: Drives) -> Floats | float:
 
 
 def counts_per_ampere(drives: Drives) -> Floats | float:
-    """Return the same the other way round."""
+    """Return the counts per ampere of 6071h and 6077h, one or shape (num_axes,)."""
     per_count = ampere_per_count(drives)
     return 1e3 if isinstance(per_count, float) else 1.0 / per_count
 
 
 def peak_current(drives: BasicDrives) -> Floats:
-    """Return the motor's peak current that a drive tells torques in [A], shape (num_axes,)."""
+    """Return the motor's peak current to which the drive's torques are relative [A], shape (num_axes,)."""
     return np.asarray(drives.read(Role.PEAK_CURRENT), float) * MILLIAMPERE
 
 
 def highest_current(drives: Drives) -> Floats | float:
-    """Return the current that no limit lets pass [A], one or (num_axes,): the motor's peak current, if it is known."""
+    """Return the highest possible current [A], one or (num_axes,): the motor's peak current; infinite if unknown."""
     per_count = ampere_per_count(drives)
     return math.inf if isinstance(per_count, float) else peak_current(drives)
 
@@ -58,7 +58,7 @@ def to_counts(drives: Drives, current: Any) -> Integers:
 def ampere_per_limit(drives: Drives) -> Floats | float:
     """Return the amperes of a count of the current limit, one or shape (num_axes,).
 
-    It counts as 6077h does, or in thousandths of the motor's nominal current where the drive has the role of that.
+    Its unit is that of 6077h, or thousandths of the motor's nominal current if the drive has that role.
     """
     device = drives.device
     if device is None or Role.NOMINAL_CURRENT not in device.roles:

@@ -1,4 +1,4 @@
-"""Drives behind drives: what a wrapper does not do otherwise, the drives below do."""
+"""Base class of wrappers of drives: calls that a wrapper does not override go to the wrapped drives."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class DrivesProxy:
-    """Drives that do what the drives below do; a wrapper overrides what it does otherwise.
+    """Drives that pass all calls to the drives below; a wrapper overrides some of them.
 
     Args:
         drives: The drives below.
@@ -35,12 +35,12 @@ class DrivesProxy:
 
     @property
     def axis_numbers(self) -> Sequence[int]:
-        """What each axis is called."""
+        """Number of each axis."""
         return self._drives.axis_numbers
 
     @property
     def device(self) -> Device | None:
-        """What the drives are; None where only their EDS is known."""
+        """The device; None if only the EDS is known."""
         return self._drives.device
 
     @property
@@ -55,17 +55,17 @@ class DrivesProxy:
 
     @property
     def safety(self) -> SafetyWatch | None:
-        """What watches over drives that may be real; None where nothing does."""
+        """The watch over drives that may be real; None without one."""
         return self._drives.safety
 
     @property
     def time_waits(self) -> bool:
-        """Whether time stands still until it is asked to pass."""
+        """Whether time passes only on request."""
         return self._drives.time_waits
 
     @property
     def observers(self) -> tuple[Observer, ...]:
-        """Who looks at these drives, the innermost first."""
+        """The observers of these drives, the innermost first."""
         return self._drives.observers
 
     def read(self, name: ObjectName) -> Integers:

@@ -1,4 +1,4 @@
-"""Emergencies of drives, from an emulator and from a bus alike."""
+"""Emergencies of drives, from an emulator or a bus."""
 
 from __future__ import annotations
 

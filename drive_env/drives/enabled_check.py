@@ -1,4 +1,4 @@
-"""A warning for set-points that go to drives of which none is enabled: nothing would move, and nothing say why."""
+"""A warning about set-points for drives of which none is enabled: nothing would move, without any message."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SET_POINTS = (
 
 
 class EnabledCheck:
-    """Looks at what is played until an axis has been enabled, or a warning given."""
+    """Checks played objects until an axis has been enabled, or a warning was given."""
 
     def __init__(self) -> None:
         self._is_done = False

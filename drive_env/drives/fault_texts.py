@@ -1,4 +1,4 @@
-"""Cause and remedy of each emergency, from the file that the page of messages is made of."""
+"""Cause and remedy of each emergency, from the source file of the page of messages."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import NamedTuple
 from mechanics.reading.untrusted import read_toml
 
 _PACKAGE = Path(__file__).parents[1]
-# In a wheel it lies in the package; in a working copy it is where the documentation is made.
+# In a wheel it is in the package; in a working copy in the documentation's sources.
 _PLACES = (_PACKAGE / "messages.toml", _PACKAGE.parent / "docs" / "messages.toml")
 
 
@@ -32,7 +32,7 @@ def _rows() -> dict[str, dict[str, str]]:
 
 
 def fault_text(name: str) -> FaultText:
-    """Return the text of an emergency by the name that its device's table gives it."""
+    """Return the text of an emergency by its name in its device's table."""
     row = _rows().get(name, {})
     row = _rows().get(row.get("same", ""), row)
     unknown = "The drive's manual lists its code."
@@ -40,5 +40,5 @@ def fault_text(name: str) -> FaultText:
 
 
 def _plain(text: str) -> str:
-    """Return a text without the marks of Markdown."""
+    """Return a text without Markdown marks."""
     return re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", text).replace("`", "")

@@ -1,4 +1,4 @@
-"""Homing methods of an axis: those that it has, and the speeds that it needs to move by one."""
+"""Homing methods that an axis has, and the speeds that a method needs."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SEARCH, EDGE = (cia402.HOMING_SPEEDS, 1), (cia402.HOMING_SPEEDS, 2)
 
 
 def methods_of(drives: AxisObjects, known: Description, axis: int) -> list[int]:
-    """Return the homing methods that an axis has: those of 60E3h, and a known device's; [] where neither tells."""
+    """Return the homing methods of an axis: those of 60E3h and of a known device's data; [] if neither lists any."""
     found: set[int] = set()
     if known.has((cia402.HOMING_METHODS, 1)):
         count = int(drives.read((cia402.HOMING_METHODS, 0))[axis])
@@ -28,10 +28,10 @@ def methods_of(drives: AxisObjects, known: Description, axis: int) -> list[int]:
 
 
 def missing_speeds(drives: AxisObjects, known: Description, axis: int, method: int) -> dict[Key, str]:
-    """Return the speeds and the acceleration that a method needs and that are 0, each with an example of a value."""
+    """Return the speeds and the acceleration that a method needs and that are 0, each with an example value."""
     needed = {} if method in HERE else {ACCELERATION: "500 rev/s^2"}
-    if method not in (*HERE, *INDEX_ALONE):  # the search of a switch, or of a stop
+    if method not in (*HERE, *INDEX_ALONE):  # it searches a switch or a stop
         needed[SEARCH] = "100 rpm"
-    if method not in HERE and method > 0:  # an edge, or an index
+    if method not in HERE and method > 0:  # it searches an edge or an index
         needed[EDGE] = "10 rpm"
     return {key: example for key, example in needed.items() if known.has(key) and drives.read(key)[axis] == 0}

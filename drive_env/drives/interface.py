@@ -1,6 +1,6 @@
-"""The Drives interface: what callers may ask of drives, emulated, on a bus, or behind an observer.
+"""The Drives interface: protocols of drives, emulated, on a bus, or behind an observer.
 
-It owns the protocols that it names; classes with a machine, a bus or a watch fit them, and stand above.
+This module defines the protocols that it names; the classes with a machine, a bus or a watch are above it.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ if TYPE_CHECKING:
 
 
 class BasicDrives(AxisObjects, Protocol):
-    """What it takes to move axes: objects that are read and written, and time that passes."""
+    """Drives as needed to move axes: objects that are read and written, and time that passes."""
 
     def advance(self, duration: float) -> None:
         """Let time pass [s], whole communication cycles."""
 
 
 class DescribedAxes(AxisObjects, Protocol):
-    """Axes of nodes, one at a time: what reads, compares and writes the parameters of a drive."""
+    """Axes of nodes, one at a time, as needed to read, compare and write the parameters of a drive."""
 
     @property
     def description(self) -> Description:
-        """What is known of the device."""
+        """The device's description."""
 
     @property
     def nodes(self) -> tuple[int, ...]:
@@ -55,33 +55,33 @@ class DescribedAxes(AxisObjects, Protocol):
 
 
 class SafetyWatch(Protocol):
-    """What watches over drives that may be real, as their user sees it."""
+    """The watch over drives that may be real, as their user sees it."""
 
     @property
     def limits(self) -> Limits:
-        """What the program may do."""
+        """The limits of the program."""
 
     @limits.setter
     def limits(self, limits: Limits) -> None: ...
 
     def change(self, limits: Limits) -> None:
-        """Take other limits; those of position are places of the rotors as 6064h shows them now."""
+        """Replace the limits; those of position are in the present counts of 6064h."""
 
     def leave_alone(self, axes: Iterable[int]) -> None:
-        """Take note of axes that the program never moves."""
+        """Note axes that the program never moves."""
 
     def watched(self) -> list[Entry]:
         """Return the objects to sample at every SYNC, the most important first."""
 
     def stop(self, reason: str) -> None:
-        """Bring what is live to rest and switch it off."""
+        """Bring live axes to rest and switch them off."""
 
     def stop_at_once(self, reason: str) -> None:
-        """Have what is live quick-stopped, from any thread and whatever the program's thread is doing."""
+        """Have live axes quick-stopped; callable from any thread, whatever the program's thread is doing."""
 
 
 class MachineSide(Protocol):
-    """The emulated machines' side that no bus shows; one value per machine unless said otherwise."""
+    """The emulated machines' side that no bus shows; one value per machine unless stated otherwise."""
 
     @property
     def drives(self) -> Drives:
@@ -89,7 +89,7 @@ class MachineSide(Protocol):
 
     @property
     def load(self) -> Load:
-        """What each machine is a copy of."""
+        """The load of each machine."""
 
     @property
     def parameters(self) -> dict[str, Floats]:
@@ -97,7 +97,7 @@ class MachineSide(Protocol):
 
     @property
     def diverged(self) -> Mask:
-        """Which machines left physics and are frozen."""
+        """Which machines have diverged and are frozen."""
 
     @property
     def load_torque(self) -> Floats:
@@ -120,58 +120,58 @@ class MachineSide(Protocol):
         """Set several true parameters [SI] at once."""
 
     def pushed(self) -> AbstractContextManager[Callable[[ArrayLike], None]]:
-        """Give what puts a torque on each axis by itself [N*m], shape (num_axes,), until the block ends."""
+        """Yield a function that puts a torque on each axis [N*m], shape (num_axes,), until the block ends."""
 
     def reset(self, where: Mask | None = None) -> None:
-        """Put machines to rest at zero and switch their drives on anew."""
+        """Put machines to rest at zero and restart their drives."""
 
 
 class Observer:
     """An observer of drives; methods that it does not override do nothing.
 
     Attributes:
-        objects: What it wants recorded, whenever time passes; with any, no time passes unseen.
-        hides_machine: Whether who uses these drives is to see no emulated machine behind them.
+        objects: Objects to record for it whenever time passes.
+        hides_machine: Whether users of these drives do not see the emulated machine behind them.
     """
 
     objects: Sequence[ObjectName] = ()
     hides_machine = False
 
     def patience(self) -> int | None:
-        """Return after how many cycles it wants to look, None for whenever a record is over."""
+        """Return the number of cycles after which it wants to be called; None: after each record."""
         return None
 
     def written(self, below: Drives, name: ObjectName, value: ArrayLike, where: Mask | None) -> None:
-        """Take note of what was written."""
+        """Note a write."""
 
     def passes(self, duration: float) -> None:
-        """Take note that time is about to pass [s]."""
+        """Note that time is about to pass [s]."""
 
     def passed(self, below: Drives, duration: float, trace: Trace, asked: Sequence[ObjectName], play: Rows) -> None:
-        """Look at what has passed.
+        """Handle a record.
 
         Args:
             below: The drives to act on.
-            duration: How long [s].
-            trace: What was recorded.
-            asked: The objects that the caller wanted.
-            play: What was played.
+            duration: Duration [s].
+            trace: The recorded trace.
+            asked: The objects that the caller requested.
+            play: The played rows.
         """
 
 
 class Drives(BasicDrives, Protocol):
-    """Everything that callers may ask of drives.
+    """The complete interface of drives.
 
     An attribute that a kind of drives lacks is None: a bus has no `machine`, emulated drives no `bus` and no `safety`.
     """
 
     @property
     def device(self) -> Device | None:
-        """The device that the drives are; None where only their EDS is known."""
+        """The device of the drives; None if only their EDS is known."""
 
     @property
     def axis_numbers(self) -> Sequence[int]:
-        """Each axis' number among all axes of the drives, of which these may be chosen ones."""
+        """Each axis' number among all axes of the drives, of which these may be a selection."""
 
     @property
     def machine(self) -> MachineSide | None:
@@ -183,15 +183,15 @@ class Drives(BasicDrives, Protocol):
 
     @property
     def safety(self) -> SafetyWatch | None:
-        """What watches over drives that may be real."""
+        """The watch over drives that may be real; None without one."""
 
     @property
     def time_waits(self) -> bool:
-        """Whether time stands still until it is asked to pass."""
+        """Whether time passes only on request."""
 
     @property
     def observers(self) -> tuple[Observer, ...]:
-        """Who looks at these drives, the innermost first."""
+        """The observers of these drives, the innermost first."""
 
     def record(self, objects: ObjectNames, duration: float, play: Rows = None, period: float = 0.001) -> Trace:
         """Let time pass [s] while objects are recorded, and others, the keys of `play`, are written row by row."""
@@ -221,7 +221,7 @@ class BusSide(Drives, DescribedAxes, Protocol):
 
     @property
     def total_timing(self) -> Timing:
-        """How punctual all SYNCs were since the drives were opened."""
+        """Punctuality of all SYNCs since the drives were opened."""
 
     def read_of(self, name: ObjectName, axes: Sequence[int]) -> Integers:
         """Return an object of some axes, in their order, as `read` does of all."""
@@ -232,12 +232,12 @@ class BusSide(Drives, DescribedAxes, Protocol):
 
 def axis_number(drives: BasicDrives, axis: int) -> int:
     """Return an axis' number in messages and results."""
-    numbers: Sequence[int] | None = getattr(drives, "axis_numbers", None)  # BasicDrives need not have them
+    numbers: Sequence[int] | None = getattr(drives, "axis_numbers", None)  # BasicDrives may lack them
     return axis if numbers is None else int(numbers[axis])
 
 
 def machine_of(drives: Drives) -> MachineSide:
-    """Return the emulated machines behind drives; ValueError for drives that have none."""
+    """Return the emulated machines behind drives; ValueError if there are none."""
     if drives.machine is None:
         raise ValueError("these drives have no emulated machine; use EmulatedDrives")
     return drives.machine
@@ -251,7 +251,7 @@ def bus_of(drives: Drives) -> BusSide:
 
 
 def device_of(drives: Drives) -> Device:
-    """Return the device that drives are; ValueError where their EDS alone is known."""
+    """Return the device of drives; ValueError if only their EDS is known."""
     if drives.device is None:
         raise ValueError("only the EDS of these drives is known; give the device by name")
     return drives.device

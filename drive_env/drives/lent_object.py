@@ -1,4 +1,4 @@
-"""An object that has another value while something moves, and its own again afterwards."""
+"""Temporarily changes an object while an axis moves, and restores it afterwards."""
 
 from __future__ import annotations
 
@@ -18,15 +18,14 @@ logger = logging.getLogger(__name__)
 
 @contextmanager
 def lent(drives: Drives, index: int, value: int, where: Mask | None = None) -> Iterator[None]:
-    """Have an object of axes another value while a block runs.
+    """Change an object of axes while a block runs.
 
-    However the block ends, the object gets back what it had; a line in the log says where that failed, and what
-    restores it.
+    However the block ends, the object is restored; if that fails, a line in the log names the axis and the remedy.
 
     Args:
         drives: The drives.
         index: The object, sub-index 0.
-        value: As the wire carries it.
+        value: The integer on the bus.
         where: Axes; all by default.
     """
     before = drives.read(index)
@@ -34,7 +33,7 @@ def lent(drives: Drives, index: int, value: int, where: Mask | None = None) -> I
         drives.write(index, value, where=where)
         yield
     finally:
-        with held_signals() as noted:  # a second Ctrl-C does not cut it short
+        with held_signals() as noted:  # a second Ctrl-C does not interrupt this
             try:
                 drives.write(index, before, where=where)
             except Exception:

@@ -1,7 +1,7 @@
-"""An axis that stands and pushes with all its current: blocked, against a stop, or with an encoder that is stuck.
+"""Detects an axis that stands at its full current: blocked, against a stop, or with a stuck encoder.
 
-The drive itself sees nothing wrong: it is enabled, in no fault, and with an encoder that is stuck even its target is
-reached. The motor has its greatest torque meanwhile, and turns as soon as what holds it gives way.
+The drive itself detects no error: it is enabled, without a fault, and with a stuck encoder even its target is reached.
+The motor has its full torque meanwhile, and turns as soon as the obstacle gives way.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from drive_env.drives.interface import Drives
 from drive_env.drives.speeds import per_increment
 from mechanics.arrays import Floats, Mask
 
-SHARE = 0.95  # of the current limit, from which on a current is at it: samples are noisy
-HELD = 0.5  # s, for which it stands so: to set off takes all the current, too, and less time
+SHARE = 0.95  # of the current limit, above which a current counts as at the limit: samples are noisy
+HELD = 0.5  # s for which it must stand at the limit: starting needs all the current, too, but for less time
 SAYS = (
     "its current is at its limit, and it stands: the axis is blocked or stands against a stop, or its encoder is "
     "stuck; disable it, and check both before it is enabled again"
@@ -25,16 +25,16 @@ SAYS = (
 
 
 class LimitAtRest:
-    """Finds axes that stand with their current at its limit; raw integers of the wire throughout.
+    """Finds axes that stand with their current at its limit; all values are raw integers on the bus.
 
     Args:
-        drives: The drives. No axis is found on drives without a current limit of their own, as steppers, without 606Ch,
-            or known by their EDS alone.
+        drives: The drives. No axis is found on drives without a current limit, as steppers, without 606Ch, or known
+            only by their EDS.
     """
 
     def __init__(self, drives: Drives) -> None:
         self.axes = drives.num_axes
-        self._since: Floats = np.full(self.axes, np.nan)  # s, when it began
+        self._since: Floats = np.full(self.axes, np.nan)  # s, since when it stands at the limit
         device = drives.device
         speed = (cia402.VELOCITY_ACTUAL, 0)
         self.is_known = device is not None and Role.CURRENT_LIMIT in device.roles and speed in device.bindings
@@ -45,14 +45,14 @@ class LimitAtRest:
             self._slow = device.standstill * increments * per_increment(drives, speed)
 
     def look(self, now: float, status: ArrayLike, current: ArrayLike, speed: ArrayLike, limit: ArrayLike) -> Mask:
-        """Return which axes have stood so for `HELD`, shape (num_axes,).
+        """Return which axes have stood at the limit for `HELD`, shape (num_axes,).
 
         Args:
             now: Time of the readings [s].
-            status: 6041h, (num_axes,), as all that follow.
+            status: 6041h, (num_axes,), like the following ones.
             current: 6077h.
             speed: 606Ch.
-            limit: The current limit, as its object has it.
+            limit: The current limit, in the units of its object.
         """
         if not self.is_known:
             return np.zeros(self.axes, bool)
@@ -62,11 +62,11 @@ class LimitAtRest:
         return np.asarray(now - self._since >= HELD)
 
     def share(self, current: ArrayLike, limit: ArrayLike) -> Floats:
-        """Return the share of its limit that each current is, shape (num_axes,); NaN of a limit of 0, or of none known.
+        """Return each current over its limit, shape (num_axes,); NaN if the limit is 0 or unknown.
 
         Args:
             current: 6077h, (num_axes,).
-            limit: The current limit, as its object has it, alike.
+            limit: The current limit, in the units of its object, (num_axes,).
         """
         if not self.is_known:
             return np.full(self.axes, np.nan)

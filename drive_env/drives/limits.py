@@ -1,4 +1,4 @@
-"""Limits of a program on drives of a bus, as the user states them."""
+"""Limits of a program on drives of a bus, as given by the user."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PerAxis = float | Sequence[float | None]
 
 NO_LIMIT = 2**62  # beyond what any object holds
 LEAST_SILENCE, MOST_SILENCE = 0.02, 65.535  # s; 1016h counts whole milliseconds in 16 bits
-DEFAULT_SPEED = 100.0  # rev/s of the rotor (6,000 rpm), of a drive that has no limit of its own
+DEFAULT_SPEED = 100.0  # rev/s of the rotor (6,000 rpm), for a drive without a limit of its own
 
 
 @dataclass(frozen=True)
@@ -24,19 +24,19 @@ class Limits:
     Each limit is one number for all axes, or a sequence with one per axis, of which None takes the drive's own.
 
     Attributes:
-        position: Lowest and highest position [unit of 6064h]; infinite for none. What is given is taken as a place of
-            the rotor when the drives are opened, and stays there whatever moves the scale or the zero (2058h, 608Fh,
-            homing); homing keeps to it, too. The drive's own are 607Dh, from which homing is exempt.
+        position: Lowest and highest position [unit of 6064h]; infinite: no limit. It is converted to a rotor position
+            when the drives are opened, and stays there when scale or zero change (2058h, 608Fh, homing); it also holds
+            in homing. The drive's own limits are 607Dh, from which homing is exempt.
         velocity: Highest speed either way [unit of 606Ch]; the drive's is 607Fh, if it has one, else 6,000 rpm of the
-            rotor. What is given is a speed of the rotor at the scale of that moment, and stays that whatever moves the
-            scale. No axis may be faster than its quick stop (6085h) brings to rest within a second.
+            rotor. It is converted to a rotor speed at the present scale, and does not change with the scale. No axis
+            may be faster than its quick stop (6085h) can stop within a second.
         current: Highest current or torque either way [unit of 6077h]; the drive's is its current limit.
-        following_error: Largest distance of demand and position in pp and csp; the drive's is 6065h. What is given is
+        following_error: Largest distance of demand and position in pp and csp; the drive's is 6065h. It is converted to
             an angle of the rotor, too.
         oscillation: Quick-stop an axis whose current oscillates.
-        stall: Longest pause between two calls while an axis is enabled [s]; None for any.
-        silence: Silence of this process after which the drive stops by itself [s]. None switches nothing on in a drive:
-            it is for drives without a heartbeat consumer (1016h) and life guarding (100Ch), and for you at the
+        stall: Longest pause between two calls while an axis is enabled [s]; None: no limit.
+        silence: Silence of this process after which the drive stops by itself [s]. None leaves the drives' watchdogs
+            off: it is for drives without a heartbeat consumer (1016h) and life guarding (100Ch), with you at the
             emergency stop.
     """
 
@@ -76,7 +76,7 @@ class Limits:
 
 
 def given(value: PerAxis | None, num_axes: int) -> Floats:
-    """Return the user's limit of each axis, shape (num_axes,); nan where only the drive's own limit holds."""
+    """Return the user's limit of each axis, shape (num_axes,); nan where the drive's own limit holds."""
     return np.broadcast_to(_values(value, math.nan), (num_axes,)).astype(float)
 
 

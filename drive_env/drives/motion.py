@@ -1,4 +1,4 @@
-"""Enable, move, stop: written once, on the Drives interface, for emulated and real drives alike."""
+"""Enable, move, stop: on the Drives interface, for emulated and real drives."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from mechanics.arrays import Integers, Mask
 if TYPE_CHECKING:
     from drive_env.devices import Device
 
-WIDEST = 2**31  # increments: a window of more is a switch
+WIDEST = 2**31  # increments: a larger window means that it is switched off
 
-STEP = 0.001  # time between two looks at the statusword [s]
-MODE_PATIENCE = 0.25  # s for which a mode may be asked for before something must be done about it
+STEP = 0.001  # time between two reads of the statusword [s]
+MODE_PATIENCE = 0.25  # s to wait for a mode before halting or giving up
 TAKEN_BACK = 0.05  # s after which a set-point whose acknowledge stays is in a drive's buffer
-REST = 0.25  # s at the target, or at home, after which a drive without bit 10 has got there
-NEAR = 10  # increments around a target, where the drive has no window of its own
-STOP_TIMEOUT = 5.0  # s, for the stop of an axis whose own mode was changed while it was enabled
-# Of each mode that follows a target as soon as it is enabled: the target, and the object that is added to it.
-# ip and tq act as csp and cst where a drive has them (TGZ manual); pp and hm move at a rising edge of bit 4 alone.
+REST = 0.25  # s at the target or at home after which a drive without bit 10 has arrived
+NEAR = 10  # increments around a target, for a drive without a window
+STOP_TIMEOUT = 5.0  # s for the stop of an axis whose manufacturer's mode was changed while it was enabled
+# For each mode that follows a target as soon as it is enabled: the target, and the object that is added to it. ip and
+# tq act like csp and cst on drives that have them (TGZ manual); pp and hm move only at a rising edge of bit 4.
 FOLLOWED = {
     "vl": (cia402.VL_TARGET_VELOCITY, None),
     "pv": (cia402.TARGET_VELOCITY, None),
@@ -55,13 +55,13 @@ def wait_for(
         drives: The drives.
         pattern: Mask and value of the statusword.
         timeout: Longest wait [s].
-        what: What is waited for, for the message.
+        what: The awaited state, for the message.
         where: Axes that count; all by default.
         or_else: Another mask and value that end the wait of an axis.
-        waited: How much of the timeout is over already [s].
+        waited: The part of the timeout that has passed already [s].
 
     Raises:
-        TimeoutError: If an axis does not get there, with its statusword; RuntimeError if one is in fault.
+        TimeoutError: If an axis does not reach it, with its statusword; RuntimeError if one is in fault.
     """
     axes = np.ones(drives.num_axes, bool) if where is None else where
     while True:
@@ -90,7 +90,7 @@ def wait_for(
 
 
 def _why_not_heard(drives: BasicDrives, status: int) -> str:
-    """Return, for a message, that a drive takes no commands; empty where its own mode is not why."""
+    """Return the text of a message on a drive that ignores commands; "" unless the manufacturer's mode is why."""
     if not _own_modes(drives) or cia402.matches(status, cia402.REMOTE):
         return ""
     return (
@@ -101,9 +101,9 @@ def _why_not_heard(drives: BasicDrives, status: int) -> str:
 def select_mode(drives: BasicDrives, mode: str, where: Mask | None = None) -> None:
     """Select a mode of operation by abbreviation on the axes that are not in it yet.
 
-    An axis that is enabled stays where it is: the mode's target is written first, as `stay` does. Of a drive whose own
-    mode must fit it, that is written, too. It stops an axis that is enabled where it sees the one without the other, as
-    on a bus; such an axis is enabled again.
+    An enabled axis keeps its position: the mode's target is written first, as by `stay`. If the drive has a
+    manufacturer's mode that must match, that is written, too. On a bus the drive may see one mode without the other and
+    stop an enabled axis; such an axis is enabled again.
     """
     if mode not in cia402.MODES:
         raise ValueError(f"no mode is named {mode!r}; there are {', '.join(cia402.MODES)}")
@@ -128,10 +128,10 @@ def select_mode(drives: BasicDrives, mode: str, where: Mask | None = None) -> No
 
 
 def stay(drives: BasicDrives, mode: str, where: Mask | None = None) -> None:
-    """Write the target by which axes stay in a mode, whatever a program has left in the drives.
+    """Write the target by which axes keep their position in a mode, whatever target a program has left there.
 
-    It is the position that they have, no speed, or no torque, less the offset that the drive adds. Modes that move at
-    an edge of the controlword alone have none.
+    It is the present position, zero speed, or zero torque, minus the offset that the drive adds. Modes that move only
+    at an edge of the controlword need none.
     """
     if mode not in FOLLOWED:
         return
@@ -141,7 +141,7 @@ def stay(drives: BasicDrives, mode: str, where: Mask | None = None) -> None:
     drives.write(name, still if offset is None else still - offset, where=where)
     device: Device | None = getattr(drives, "device", None)
     if name == cia402.TARGET_POSITION and device is not None and Role.TARGET_INSIDE in device.roles:
-        # It doubles 607Ah: an image that carries it would bring its old value back.
+        # It doubles 607Ah: an image that carries it would restore its old value.
         drives.write(Role.TARGET_INSIDE, drives.read(Role.POSITION_INSIDE), where=where)
 
 
@@ -156,11 +156,11 @@ def _read_if_there(drives: BasicDrives, name: int) -> Integers | None:
 
 
 def _stay_in_own_mode(drives: BasicDrives, axes: Mask, mode: str | None) -> None:
-    """Keep axes in place once they are enabled: in a mode, or with None in each axis' own."""
+    """Keep axes in place once they are enabled: in a mode, or, for None, in each axis' present mode."""
     if mode is not None:
         stay(drives, mode, axes)
         return
-    # A drive may show a mode only once it is enabled: what was asked for counts, too.
+    # A drive may show a mode only once it is enabled: the requested mode counts, too.
     asked, shown = drives.read(cia402.MODE), _shown_modes(drives)
     for name in FOLLOWED:
         number = cia402.MODES[name]
@@ -172,8 +172,8 @@ def _stay_in_own_mode(drives: BasicDrives, axes: Mask, mode: str | None) -> None
 def _await_mode(drives: BasicDrives, mode: str, axes: Mask, timeout: float = 1.0) -> None:
     """Let time pass until 6061h shows a mode.
 
-    A drive may be slow; it may change modes at a halt alone, so that enabled axes that do not show the mode are halted
-    until they do; and it may show a mode only once it is enabled, so that a disabled axis is not waited for for long.
+    A drive may be slow; it may change modes only at a halt, so enabled axes that do not show the mode are halted until
+    they do; and it may show a mode only once it is enabled, so the wait for disabled axes is short.
 
     Raises:
         TimeoutError: If an enabled axis does not get into the mode; it is halted then.
@@ -204,7 +204,7 @@ def _await_mode(drives: BasicDrives, mode: str, axes: Mask, timeout: float = 1.0
 
 
 def _not_in_mode(drives: BasicDrives, mode: str, axes: Mask) -> Mask:
-    """Return the axes that show another mode; none where a drive does not show its mode."""
+    """Return the axes that show another mode; an all-false mask if the drives do not show their mode."""
     shown = _shown_modes(drives)
     return np.zeros_like(axes) if shown is None else np.asarray(axes & (shown != cia402.MODES[mode]))
 
@@ -218,13 +218,13 @@ def _shown_modes(drives: BasicDrives) -> Integers | None:
 
 
 def _own_modes(drives: BasicDrives) -> Mapping[int, int]:
-    """Return the drive's own mode that each mode of operation needs; empty of drives that have no such thing."""
-    device: Device | None = getattr(drives, "device", None)  # BasicDrives need not know their device
+    """Return the manufacturer's mode that each mode of operation needs; empty for drives without one."""
+    device: Device | None = getattr(drives, "device", None)  # BasicDrives may lack it
     return {} if device is None else device.mode_gate
 
 
 def _enable_again(drives: BasicDrives, axes: Mask) -> None:
-    """Enable axes that the change of their own mode has stopped."""
+    """Enable axes that the change of the manufacturer's mode has stopped."""
     drives.advance(STEP)
     lost = axes & ~cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED)
     if lost.any():
@@ -233,9 +233,9 @@ def _enable_again(drives: BasicDrives, axes: Mask) -> None:
 
 
 def take_command(drives: BasicDrives, where: Mask | None = None) -> None:
-    """Have axes take commands that ignore them, since their own mode does not fit the mode of operation.
+    """Have axes take commands again that ignore them because the manufacturer's mode does not match.
 
-    Whatever stops an axis calls it first: a command that is ignored stops nothing.
+    Every function that stops axes calls it first, since an ignored command stops nothing.
     """
     own_modes = _own_modes(drives)
     if not own_modes:
@@ -248,24 +248,23 @@ def take_command(drives: BasicDrives, where: Mask | None = None) -> None:
     known = ignores & (needed >= 0)
     if known.any():
         drives.write(Role.MODE_GATE, np.maximum(needed, 0), where=known)
-        drives.advance(STEP)  # the drive looks at it once in a period
+        drives.advance(STEP)  # the drive checks it once per period
 
 
 def enable(drives: BasicDrives, mode: str | None = None, where: Mask | None = None, timeout: float = 1.0) -> None:
-    """Take drives to operation enabled, a fault being reset first; `mode` is selected before.
+    """Reset faults, select `mode`, and take drives to operation enabled.
 
-    Axes that were not enabled stay where they are: what a program has left in the target of the mode moves nothing.
-    Targets are written afterwards. Axes that are enabled already go on.
+    Axes that were not enabled keep their position, whatever target a program has left. Write targets afterwards. Axes
+    that are enabled already go on.
 
     Args:
         drives: The drives.
-        mode: Abbreviation of a mode; None leaves it.
+        mode: Abbreviation of a mode; None: unchanged.
         where: Axes; all by default.
-        timeout: Longest wait for each state [s]; a drive that waits for its brake needs its delays, and more.
+        timeout: Longest wait for each state [s]; a drive with a brake needs more than the brake's delays.
 
     Raises:
-        TimeoutError: If a state, or the mode, is not reached in time. An axis that is late is not left on its way
-            there.
+        TimeoutError: If a state, or the mode, is not reached in time. A late axis is disabled again.
     """
     status = drives.read(cia402.STATUSWORD)
     axes = np.ones(drives.num_axes, bool) if where is None else where
@@ -280,7 +279,7 @@ def enable(drives: BasicDrives, mode: str | None = None, where: Mask | None = No
     if stopped.any():
         _stay_in_own_mode(drives, stopped, mode)
         drives.write(cia402.CONTROLWORD, cia402.ENABLE_OPERATION, where=stopped)
-        # By 605Ah the drive takes transition 16, or goes on to switch on disabled by itself: it is enabled from there.
+        # By 605Ah the drive takes transition 16, or goes on to switch on disabled by itself, from where it is enabled.
         wait_for(drives, cia402.OPERATION_ENABLED, timeout, "the end of the quick stop", stopped,
                  or_else=cia402.SWITCH_ON_DISABLED)  # fmt: skip
     not_enabled = axes & ~cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED)
@@ -297,7 +296,7 @@ def enable(drives: BasicDrives, mode: str | None = None, where: Mask | None = No
         try:
             wait_for(drives, state, timeout, name, not_enabled)
         except TimeoutError:
-            # A drive that waits for its brake would enable later, unexpectedly.
+            # A drive that waits for its brake would be enabled later, unexpectedly.
             late = not_enabled & ~cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED)
             drives.write(cia402.CONTROLWORD, cia402.SHUTDOWN, where=late)
             raise
@@ -321,12 +320,12 @@ def quick_stop(drives: BasicDrives, where: Mask | None = None) -> None:
 
 
 def _command_stop(drives: BasicDrives, word: int, where: Mask | None) -> None:
-    """Write a controlword that stops axes; twice to those that turn out to have ignored it."""
+    """Write a controlword that stops axes; twice if an axis turns out to have ignored it."""
     take_command(drives, where)
     drives.write(cia402.CONTROLWORD, word, where=where)
     if not _own_modes(drives):
         return
-    drives.advance(STEP)  # a statusword may be older than a change of the drive's own mode by another program
+    drives.advance(STEP)  # a statusword may be older than another program's change of the manufacturer's mode
     ignored = ~cia402.matches(drives.read(cia402.STATUSWORD), cia402.REMOTE)
     ignored = ignored if where is None else ignored & where
     if ignored.any():
@@ -363,11 +362,11 @@ def start_move(
 ) -> None:
     """Start a move in pp to a position [inc], with the set-point handshake of bits 4 and 12.
 
-    A drive that would put the set-point into a buffer, until the move before has ended, gets it with bit 5: at once.
+    If a drive would buffer the set-point until the previous move has ended, bit 5 makes it act at once.
 
     Raises:
         RuntimeError: If an axis is not enabled, or not in pp; nothing is written.
-        TimeoutError: If the drive does not take the set-point within `timeout` [s].
+        TimeoutError: If the drive does not accept the set-point within `timeout` [s].
     """
     _check_can_move(drives, where)
     axes = np.ones(drives.num_axes, bool) if where is None else where
@@ -376,20 +375,20 @@ def start_move(
     with _bit_4_is_low(drives, word, where):
         kept = _still_acknowledged(drives, where)
         if relative and kept.any():
-            # The buffer is full: an edge would be ignored, and the acknowledge of the move before taken for its own.
+            # The buffer is full: an edge would be ignored, and the previous move's acknowledge mistaken for its own.
             wait_for(drives, cia402.SET_POINT_TAKEN_BACK, timeout, "room for another relative move", kept)
             kept = np.zeros_like(kept)
         if (others := axes & ~kept).any():
             _raise_bit_4(drives, word, others, timeout)
             kept = kept | _still_acknowledged(drives, others)
-        if kept.any() and not relative:  # a relative one ends at the same place from the buffer, and must not go twice
-            # Here bit 12 is 1 already: that it falls afterwards tells that the set-point was taken.
+        if kept.any() and not relative:  # a relative move ends there from the buffer, too, and must not be sent twice
+            # Bit 12 is already 1 here: its fall afterwards shows that the set-point was accepted.
             _raise_bit_4(drives, word, kept, timeout, cia402.CHANGE_AT_ONCE)
         wait_for(drives, cia402.SET_POINT_TAKEN_BACK, timeout, "end of set-point acknowledge", where)
 
 
 def _raise_bit_4(drives: BasicDrives, word: int, where: Mask, timeout: float, more: int = 0) -> None:
-    """Have axes take their set-point at a rising edge, and lower the bit again."""
+    """Make axes accept their set-point at a rising edge, and lower the bit again."""
     drives.write(cia402.CONTROLWORD, word | more | cia402.NEW_SET_POINT, where=where)
     wait_for(drives, cia402.SET_POINT_ACKNOWLEDGED, timeout, "set-point acknowledge", where)
     drives.write(cia402.CONTROLWORD, word, where=where)
@@ -397,16 +396,16 @@ def _raise_bit_4(drives: BasicDrives, word: int, where: Mask, timeout: float, mo
 
 @contextlib.contextmanager
 def _bit_4_is_low(drives: BasicDrives, word: int, where: Mask | None) -> Iterator[None]:
-    """Lower bit 4 of the controlword, which must rise to begin anything; and again if the block fails.
+    """Lower bit 4 of the controlword, whose rising edge begins a move; and again if the block fails.
 
-    Left high it would keep each move and each homing from beginning until the axis is disabled.
+    Left high it would prevent every move and homing until the axis is disabled.
     """
     drives.write(cia402.CONTROLWORD, word, where=where)
     try:
         yield
     except BaseException:
-        with contextlib.suppress(Exception):  # what went wrong says more than that this fails, too
-            # An axis that was stopped must not be enabled by it.
+        with contextlib.suppress(Exception):  # the first error is more informative than this one
+            # A stopped axis must not be enabled by it.
             on = np.asarray(cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED))
             if (left := on if where is None else on & where).any():
                 drives.write(cia402.CONTROLWORD, word, where=left)
@@ -414,7 +413,7 @@ def _bit_4_is_low(drives: BasicDrives, word: int, where: Mask | None) -> Iterato
 
 
 def _still_acknowledged(drives: BasicDrives, where: Mask | None) -> Mask:
-    """Return the axes whose acknowledge stays though bit 4 of the controlword is back."""
+    """Return the axes whose acknowledge stays although bit 4 of the controlword is low again."""
     axes = np.ones(drives.num_axes, bool) if where is None else where
     waited = 0.0
     while True:
@@ -435,7 +434,7 @@ def move_to(
 ) -> None:
     """Move in pp to a position [inc] and wait until it is reached.
 
-    A drive that never shows bit 10 is there once it has stood at its target for a while.
+    A drive without bit 10 has arrived once it has stood at its target for a while.
 
     Raises:
         RuntimeError: If an axis is not enabled, or not in pp; nothing is written.
@@ -459,7 +458,7 @@ def move_to(
 
 
 def _stands_at(drives: BasicDrives, goal: Integers, axes: Mask) -> Mask:
-    """Let a while pass, and return the axes that stand at their target without saying so; none if one may move."""
+    """Let a while pass, and return the axes that stand at their target without bit 10; all False if one moves."""
     before = drives.read(cia402.POSITION_ACTUAL)
     near = max(NEAR, _window(drives))
     if not np.any(axes & (np.abs(before - goal) <= near)):
@@ -501,11 +500,11 @@ def _check_can_move(drives: BasicDrives, where: Mask | None, modes: tuple[str, .
 def turn(drives: BasicDrives, velocity: ArrayLike, where: Mask | None = None) -> None:
     """Have enabled axes turn at a velocity, in vl (6042h, and bits 4 to 6 of the controlword) or pv (60FFh).
 
-    In vl these bits let the ramp lead the axis; `enable` leaves them 0. With another controlword it comes to rest.
+    In vl these bits enable the ramp; `enable` leaves them 0, and without them the axis comes to rest.
 
     Args:
         drives: The drives.
-        velocity: In the unit of 6042h, rpm unless 604Bh and 604Ch say another, or of 60FFh.
+        velocity: In the unit of 6042h (rpm unless 604Bh and 604Ch define another) or of 60FFh.
         where: Axes; all by default.
 
     Raises:
@@ -521,9 +520,9 @@ def turn(drives: BasicDrives, velocity: ArrayLike, where: Mask | None = None) ->
 
 
 def turning_mode(drives: BasicDrives) -> str:
-    """Return the mode in which drives turn at a velocity: pv, or vl of drives without it by 6502h, else by 60FFh."""
+    """Return the mode for turning at a velocity: pv, or vl for drives without pv by 6502h, otherwise by 60FFh."""
     supported = _read_if_there(drives, cia402.SUPPORTED_MODES)
-    if supported is None or not supported.all():  # a drive that does not say
+    if supported is None or not supported.all():  # a drive that does not report its modes
         return "vl" if _read_if_there(drives, cia402.TARGET_VELOCITY) is None else "pv"
     has_vl, has_pv = (supported >> (cia402.MODES[name] - 1) & 1 for name in ("vl", "pv"))
     return "vl" if np.any(has_vl & ~has_pv) else "pv"
@@ -541,7 +540,7 @@ def home(drives: BasicDrives, where: Mask | None = None, timeout: float = 60.0) 
     """Run the homing method of 6098h and wait until home is attained; the axes are enabled, in hm, afterwards.
 
     Raises:
-        RuntimeError: If an axis gives up, or ends in fault.
+        RuntimeError: If an axis aborts homing, or ends in fault.
         TimeoutError: If home is not attained within `timeout` [s].
     """
     axes = np.ones(drives.num_axes, bool) if where is None else where
@@ -560,10 +559,10 @@ def home(drives: BasicDrives, where: Mask | None = None, timeout: float = 60.0) 
 
 
 def _await_home(drives: BasicDrives, axes: Mask, timeout: float) -> None:
-    """Let time pass until axes that are homing have attained home."""
+    """Let time pass until the axes have completed homing."""
     waited, silent = 0.0, 0
     while True:
-        drives.advance(2 * STEP)  # the first look comes after the drive has begun
+        drives.advance(2 * STEP)  # the first look must come after the drive has begun
         waited += 2 * STEP
         status = drives.read(cia402.STATUSWORD)
         fault = axes & cia402.matches(status, cia402.FAULT_BIT)
@@ -579,7 +578,7 @@ def _await_home(drives: BasicDrives, axes: Mask, timeout: float) -> None:
         still = axes & (bits != cia402.HOMED)
         if not still.any():
             break
-        # Bit 12 alone is home that is left again for where the axis rests, or home on a drive without bit 10.
+        # Bit 12 alone: home was left again for the resting position, or the drive has no bit 10.
         silent = silent + 1 if np.all(bits[still] == cia402.HOMING_UNDER_WAY[1]) else 0
         if silent * 2 * STEP >= REST and _rests(drives, still):
             break
@@ -590,7 +589,7 @@ def _await_home(drives: BasicDrives, axes: Mask, timeout: float) -> None:
 
 
 def _rests(drives: BasicDrives, axes: Mask) -> bool:
-    """Let a while pass, and return whether axes have stood through it."""
+    """Let a while pass, and return whether axes have stood all that time."""
     before = drives.read(cia402.POSITION_ACTUAL)
     drives.advance(REST)
     return bool(np.all(np.abs(drives.read(cia402.POSITION_ACTUAL) - before)[axes] <= NEAR))

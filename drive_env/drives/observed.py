@@ -1,4 +1,4 @@
-"""Drives with observers: one wrapper, and observers that count, monitor, act, or hide something."""
+"""Drives with observers: a wrapper whose observers count, monitor, act, or hide something."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ CYCLE = 0.001  # s
 
 
 class ObservedDrives(DrivesProxy):
-    """Drives and who looks at them.
+    """Drives with observers.
 
     Args:
         drives: The drives.
-        observers: Who looks at them, one after the other.
+        observers: The observers, called one after the other.
     """
 
     def __init__(self, drives: Drives, *observers: Observer) -> None:
@@ -38,11 +38,11 @@ class ObservedDrives(DrivesProxy):
 
     @property
     def observers(self) -> tuple[Observer, ...]:
-        """Who looks at these drives, the innermost first."""
+        """The observers of these drives, the innermost first."""
         return (*self._drives.observers, *self._observers)
 
     def write(self, name: ObjectName, value: ArrayLike, where: Mask | None = None) -> None:
-        """Write an object, and tell the observers."""
+        """Write an object, and notify the observers."""
         self._drives.write(name, value, where=where)
         for observer in self._observers:
             observer.written(self._drives, name, value, where)
@@ -58,7 +58,7 @@ class ObservedDrives(DrivesProxy):
         self._drives.advance(duration)
 
     def record(self, objects: ObjectNames, duration: float, play: Rows = None, period: float = CYCLE) -> Trace:
-        """Let time pass while objects are recorded and played, and have observers look at it as it goes on."""
+        """Let time pass while objects are recorded and played, and call the observers meanwhile."""
         asked: list[ObjectName] = [objects] if isinstance(objects, int | str | Role) else list(objects)
         wanted = list(asked)
         for observer in self._observers:

@@ -1,4 +1,4 @@
-"""What drives report of the faults that they are in: 603Fh, 1003h, emergencies, else 1001h and their status flags."""
+"""Faults reported by drives: by 603Fh, 1003h and emergencies, otherwise by 1001h and their status flags."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class FaultReport(NamedTuple):
         axis: Its number.
         status: Statusword 6041h.
         register: Error register 1001h, of the whole node; None if the drive has none.
-        source: The objects that name the causes; "" if none does.
-        causes: The possible causes: one, or several that the drive does not tell apart. () without a fault.
+        source: The objects that name the causes; "" if there is no such object.
+        causes: The possible causes: one, or several that the drive does not distinguish. () without a fault.
     """
 
     axis: int
@@ -42,11 +42,11 @@ class FaultReport(NamedTuple):
 
 
 def read_faults(drives: Drives, known: Description) -> list[FaultReport]:
-    """Read what every axis reports of its fault; nothing is written.
+    """Read every axis' report of its fault; nothing is written.
 
     Args:
         drives: The drives.
-        known: Of their device.
+        known: Their device's description.
     """
     status = drives.read(cia402.STATUSWORD)
     register = drives.read(ERROR_REGISTER) if known.has(ERROR_REGISTER) else None
@@ -66,7 +66,7 @@ def read_faults(drives: Drives, known: Description) -> list[FaultReport]:
 def _named(
     drives: Drives, known: Description, axis: int, register: int | None, heard: list[EmergencyMessage]
 ) -> tuple[str, list[str]]:
-    """Return the names of the causes of an axis' fault, and the source that tells the most of them."""
+    """Return the names of an axis' fault causes, and the source with the most of them."""
     if told := [message.name for message in heard if message.axis == axis and message.code]:
         return "EMCY", told
     if known.has(cia402.ERROR_CODE) and (code := int(drives.read(cia402.ERROR_CODE)[axis])):
@@ -77,9 +77,9 @@ def _named(
 
 
 def _newest(drives: Drives, known: Description, axis: int) -> int:
-    """Return the newest entry of 1003h that is about an axis; 0 if no entry is.
+    """Return the newest entry of 1003h for an axis; 0 if there is none.
 
-    A known device has the axis in bits 16 to 23; with other drives these bits are the maker's (CiA 301).
+    A known device has the axis in bits 16 to 23; for other drives these bits are maker-specific (CiA 301).
     """
     count = int(drives.read((ERROR_HISTORY, 0))[axis])
     for sub in range(1, count + 1):
@@ -97,7 +97,7 @@ def _newest(drives: Drives, known: Description, axis: int) -> int:
 
 
 def _deduced(drives: Drives, known: Description, axis: int, register: int | None) -> tuple[str, list[str]]:
-    """Return those of a known device's causes that 1001h and its status flags allow; [] for an unknown device."""
+    """Return the causes of a known device that fit 1001h and its status flags; [] for an unknown device."""
     if known.device is None or register is None:
         return "", []
     flags_key = known.role(Role.MOTOR_FLAGS)

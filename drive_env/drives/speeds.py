@@ -1,4 +1,4 @@
-"""How drives count speeds and accelerations: in increments of position, in rpm, or in a unit of their own."""
+"""Units of speeds and accelerations: increments of position, rpm, or a unit of the drive."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from drive_env.drives.interface import Drives
 from mechanics.arrays import Floats
 
 _BY_MINUTE = ("rpm", "rpm/s")
-_BY_RATIO = ("velocity unit", "velocity unit/s")  # a drive's own, so many rpm as two of its objects say
+_BY_RATIO = ("velocity unit", "velocity unit/s")  # a drive's own unit, whose rpm two of its objects give
 
 
 def per_increment(drives: Drives, name: int | tuple[int, int]) -> Floats | float:
-    """Return the counts that an object has of one increment a second (or second squared), 1 or shape (num_axes,).
+    """Return an object's counts per increment a second (or second squared), 1 or shape (num_axes,).
 
-    A drive that is known by its EDS alone is taken to count increments.
+    For a drive known only by its EDS increments are assumed.
 
     Args:
         drives: Emulated, or on a bus.
@@ -34,7 +34,7 @@ def per_increment(drives: Drives, name: int | tuple[int, int]) -> Floats | float
 
 
 def rpm_of_unit(drives: Drives) -> Floats:
-    """Return the rpm of a velocity unit, shape (num_axes,); 1 of drives that have no such unit."""
+    """Return the rpm of a velocity unit, shape (num_axes,); 1 for drives without such a unit."""
     device = drives.device
     ratio = None if device is None else velocity_ratio(device.roles)
     if ratio is None:
@@ -43,7 +43,7 @@ def rpm_of_unit(drives: Drives) -> Floats:
 
 
 def per_increment_of(unit: str, scaler: float, ratio: float = 1.0) -> float:
-    """Return the same for a unit, a scale of positions [inc/rev], and the rpm of a velocity unit."""
+    """Return the counts of a unit per increment, by the position scale [inc/rev] and the rpm of a velocity unit."""
     number, base = split_unit(unit)
     if base in _BY_RATIO:
         return 60.0 / scaler / ratio / number

@@ -1,4 +1,4 @@
-"""What `record` returns, from an emulator and from a bus alike."""
+"""The result of `record`, from an emulator or a bus."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ Scales = Callable[[], Sequence[Scale]]
 class Trace:
     """A recorded move: sample times `t` [s], shape (n,), and each object's integers, shape (n, num_axes).
 
-    `trace["Velocity actual value"]` are integers as the wire carries them, `trace["Velocity actual value", "rad/s"]`
-    floats in a unit. Printed, it says what it holds.
+    `trace["Velocity actual value"]` are integers on the bus, `trace["Velocity actual value", "rad/s"]` floats in a
+    unit. Printing it lists its contents.
 
     Args:
         t: Sample times [s].
         values: Integers by index and sub-index.
-        dictionary: Where names and units are found.
-        scale: Gives what the units of each axis follow, as far as the drive says it; asked when a unit needs it.
-            Without it nothing of it is known.
+        dictionary: Names and units of the objects.
+        scale: Returns the scale of each axis' units, as far as the drive reports it; called when a unit needs it. None:
+            the scale is unknown.
     """
 
     def __init__(
@@ -68,7 +68,7 @@ class Trace:
 
     @classmethod
     def joined(cls, traces: Sequence[Trace], period: float) -> Trace:
-        """Return as one what was recorded in parts, at least one, of the same objects at the same period [s]."""
+        """Join traces, at least one, of the same objects at the same period [s], recorded one after the other."""
         first = traces[0]
         values = {key: np.concatenate([trace._values[key] for trace in traces]) for key in first._values}
         rows = sum(map(len, traces))
@@ -114,7 +114,7 @@ class Trace:
         return DataFrame(dict(self._columns()), index=Index(self.t, name="t [s]"))
 
     def plot(self) -> Figure:
-        """Return a matplotlib figure: a panel for each object, a line for each axis, in units that people read."""
+        """Return a matplotlib figure: a panel for each object, a line for each axis, in readable units."""
         from matplotlib.figure import Figure
 
         figure = Figure(figsize=(9.0, 1.2 + 1.9 * len(self._values)), layout="constrained")
@@ -141,7 +141,7 @@ class Trace:
         return next((values.shape[-1] for values in self._values.values()), 0)
 
     def _columns(self) -> Iterator[tuple[str, Integers]]:
-        """Give name and values of each column, shape (n,)."""
+        """Yield name and values of each column, shape (n,)."""
         for key, values in self._values.items():
             entry = self._dictionary.find(key)
             name = f"{entry.label} [{entry.unit}]" if entry.unit else entry.label
@@ -149,7 +149,7 @@ class Trace:
                 yield (name if self._axes == 1 else f"{name} (axis {axis})"), values[:, axis]
 
     def _scales(self, entry: Entry) -> Sequence[Scale]:
-        # Not asked of a drive where no unit follows them.
+        # The drive is not asked unless a unit needs it.
         if self._scale is None or not follows_scale(entry.unit):
             return [None] * self._axes
         return self._scale()

@@ -1,7 +1,7 @@
-"""The same few cycles again and again: set-points out, samples in, with an agent's own compiled code beside them.
+"""The same few cycles repeated: set-points out, samples in, with an agent's compiled code running beside them.
 
-What an outer controller computes for each machine is computed in the thread that runs the machine, so that it takes
-part in what threads gain.
+The outer controller of each machine is computed in the thread that runs the machine, so that it also gains from
+threads.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 class Hooks(NamedTuple):
     """Compiled code that runs before and after the cycles, for the axes `first` up to `first + count` at a time.
 
-    Both are `cached` functions of (address of the bundle, first, count) that return an integer; several threads may be
-    in them at once, each with axes of whole machines of its own.
+    Both are `cached` functions of (address of the bundle, first, count) that return an integer; several threads may
+    call them at once, each for the axes of different machines.
     """
 
     before: Any
@@ -38,12 +38,12 @@ class Hooks(NamedTuple):
 
 
 class CyclicControl:
-    """A call of `record` with memory of its own, on any Drives.
+    """A repeated call of `record` on any Drives, with reused arrays.
 
     Attributes:
-        play: What is played.
+        play: The played objects.
         played: Integers to play, shape (objects, cycles, num_axes); filled in by the caller, or by `before`.
-        sampled: Integers of each cycle, written, shape (objects, cycles, num_axes).
+        sampled: Sampled integers of each cycle, shape (objects, cycles, num_axes).
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class CyclicControl:
 
 @dataclass(eq=False)
 class Conversion(Bundle):
-    """Integers that are played and sampled, their factors [SI per drive unit], and whose hooks run beside."""
+    """Integers that are played and sampled, their factors [SI per drive unit], and the hooks."""
 
     played: NumberCube  # (objects, cycles, axes)
     factors: Matrix  # (objects, axes)
@@ -83,7 +83,7 @@ class Conversion(Bundle):
     sample_factors: Matrix
     sample_codes: Matrix
     samples: Cube  # SI
-    refused: Numbers  # (1,) not 0: an integer was out of range, and its group stayed as it was
+    refused: Numbers  # (1,) not 0: an integer was out of range, and its group was not run
     before: int = 0
     after: int = 0
     data: int = 0
@@ -108,7 +108,7 @@ def convert_in(address: Any, first: Any, count: Any) -> Any:
 
 @cached(allocates=False)
 def convert_out(address: Any, first: Any, count: Any) -> Any:
-    """Bring samples into drive units, and run the hook after."""
+    """Convert samples to drive units, and run the hook after."""
     own = conversion_at(address)
     to_od_rows(own.samples, own.sample_factors, own.sample_codes, own.sampled, first, first + count)
     if own.after != 0:
@@ -117,7 +117,7 @@ def convert_out(address: Any, first: Any, count: Any) -> Any:
 
 
 class EmulatedCyclicControl(CyclicControl):
-    """The same on emulated drives, without the interpreter once it has begun."""
+    """The same on emulated drives, without the interpreter once it has started."""
 
     def __init__(
         self, drives: EmulatedDrives, objects: Sequence[ObjectName], play: Sequence[ObjectName], cycles: int
@@ -128,7 +128,7 @@ class EmulatedCyclicControl(CyclicControl):
         self._scale_changes = -1
 
     def run(self) -> None:
-        """Let the cycles pass; of axes whose integers are out of range none of the group is run."""
+        """Let the cycles pass; a group with integers out of range does not run."""
         if self._scale_changes != self._emulated.inside.objects.scale_changes:
             self._prepare()
         if self._prepared is None:
@@ -141,7 +141,7 @@ class EmulatedCyclicControl(CyclicControl):
 
     def _prepare(self) -> None:
         drives, hooks = self._emulated, self.hooks
-        # What cannot be recorded or played at all is refused here.
+        # An object that can never be recorded or played is refused here.
         for name in self._objects:
             drives.inside.objects.recordable(drives.inside.objects.entries.find(name))
         drives.inside.objects.plan_play(dict(zip(self.play, self.played, strict=True)), self._cycles)
@@ -177,7 +177,7 @@ class EmulatedCyclicControl(CyclicControl):
 def cyclic_control(
     drives: Drives, objects: Sequence[ObjectName], play: Sequence[ObjectName], cycles: int, period: float
 ) -> CyclicControl:
-    """Return the control of some cycles of `period` [s], in the way that is best for these drives."""
+    """Return the control of some cycles of `period` [s], in the fastest way for these drives."""
     from drive_env.emulator.emulated_drives import EmulatedDrives
 
     if isinstance(drives, EmulatedDrives):

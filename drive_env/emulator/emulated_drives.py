@@ -1,6 +1,6 @@
-"""The Drives interface, and emulated drives behind it.
+"""Emulated drives behind the Drives interface.
 
-Whatever acts on a drive uses this interface and nothing deeper, so that it runs on the emulator and on a bus alike.
+Code that acts on drives uses only this interface, so that it runs on the emulator and on a bus alike.
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ from mechanics.load import Load
 from mechanics.loads import find_load
 from mechanics.packed import PackedLoad
 
-MOST_PREPARED = 64  # calls of record that are kept prepared: more than any loop makes in turn
+MOST_PREPARED = 64  # prepared calls of record that are kept: more than any loop alternates between
 
 MOST_MACHINES = 65_536  # some 17 kB each: 1.1 GB
 
 
 def check_number_of_machines(number: int) -> None:
-    """Raise ValueError for a number of machines that cannot be."""
+    """Raise ValueError for an impossible number of machines."""
     if number < 1:
         raise ValueError(f"num_machines must be 1 or more, not {number}")
     if number > MOST_MACHINES:
@@ -63,39 +63,38 @@ def check_number_of_machines(number: int) -> None:
 
 
 class EmulatedDrives(Saved):
-    """Emulated drives that turn emulated machines.
+    """Emulated drives with emulated machines.
 
-    The drives come up commissioned for their motor and in switch on disabled; with `commissioned=False` they have their
-    factory values, and nothing moves until they are commissioned.
+    The drives start commissioned for their motor, in switch on disabled; with `commissioned=False` they have their
+    factory values, and cannot move until they are commissioned.
 
     Args:
         device: Name of the device.
         load: A load's name, the path of your own MJCF, or a `mechanics.Load`.
         motor: Name of the motor, the path of your own motor's TOML, or a `Motor`; by default the device's usual one.
         num_machines: Machines, each with its drives.
-        seed: Seed of everything random. Machine k of a seed is the same machine in every set.
-        commissioned: Give the drives their motor's preset; otherwise they have their factory values.
+        seed: Seed of everything random. Machine k of a seed is the same machine in every set of drives.
+        commissioned: Whether the drives have their motor's preset instead of their factory values.
         first_machine: Number of the first machine.
-        distinct: After so many machines the same ones come again, their noise included: for comparing
-            gains. None: never.
-        randomise: Parameters to draw per machine: True for all, or names or groups ("load", "motor.R_s"). How a motor
-            is wired is drawn with the rest where the drives have factory values; commissioned ones know it, and it is
-            drawn where it is named ("motor.encoder_direction").
-        ideal: Take a stage, encoder and bearings without faults.
+        distinct: After this number the machines repeat, including their noise: for comparing gains. None: never.
+        randomise: Parameters to draw per machine: True for all, or names or groups ("load", "motor.R_s"). The wiring of
+            a motor is included only if the drives have factory values: commissioned ones know it, so it is drawn only
+            if it is named ("motor.encoder_direction").
+        ideal: Whether power stage, encoder and bearings have no imperfections.
         parameters: True machine parameters [SI] that replace defaults and draws: one value or one per machine.
         supply: Supply voltage [V]; by default the motor's, or the highest that the device is built for.
         num_threads: Threads that run machines; the cores that this process may use by default.
         physics_steps: Physics steps per velocity-loop period.
         integrator: "leapfrog", or "rk4", the slower oracle.
-        friction: How the load's friction is modelled: "none", "coulomb_viscous", "stribeck" or "lugre".
+        friction: Model of the load's friction: "none", "coulomb_viscous", "stribeck" or "lugre".
 
     Raises:
-        ValueError: For an unknown name, a motor that the device does not turn, or a machine that cannot be.
+        ValueError: For an unknown name, a motor that the device cannot turn, or an impossible machine.
     """
 
     STATE = ("inside", "faults")
 
-    # Of the Drives interface: what emulated drives do not have, and their time, which passes when it is asked to.
+    # Of the Drives interface: attributes that emulated drives lack, and their time, which passes only on request.
     bus = None
     safety = None
     observers = ()
@@ -122,7 +121,7 @@ class EmulatedDrives(Saved):
         friction: str = "stribeck",
     ) -> None:
         check_number_of_machines(num_machines)
-        self._rated = self.device = find_device(device)  # with the rates that it was made for
+        self._rated = self.device = find_device(device)  # with its original rates
         self.image_period = self.device.cycle
         self.motor = find_motor(self.device.default_motor if motor is None else motor)
         self.device.check_motor(self.motor)
@@ -156,12 +155,12 @@ class EmulatedDrives(Saved):
 
     @property
     def codes(self) -> Mapping[tuple[int, int], Code]:
-        """How the integers of bound objects are SI values, by index and sub-index."""
+        """Conversions of bound objects, by index and sub-index."""
         return self.inside.objects.codes
 
     # --- the interface --------------------------------------------------------------------------------------------
     def read(self, name: ObjectName) -> Integers:
-        """Return an object as the wire carries it, int64 of shape (num_axes,); a text as an array of str.
+        """Return an object as integers on the bus, int64 of shape (num_axes,); a text as an array of str.
 
         Raises:
             ObjectAccessError: If there is no such object or it cannot be read.
@@ -202,10 +201,9 @@ class EmulatedDrives(Saved):
         self._run(cycles, self._nothing)
 
     def set_cycle(self, cycle: float) -> None:
-        """Let process images be `cycle` [s] apart, and a communication cycle as long, the device's own at the most.
+        """Set the time between process images to `cycle` [s], and the communication cycle, at most to the device's.
 
-        Time goes on from where it is. A step of physics is no longer than before; the velocity loop has the nearest
-        lower rate that fits the cycle.
+        Time continues. A physics step does not become longer; the velocity loop gets the nearest lower rate that fits.
         """
         device = with_cycle(self._rated, cycle)
         self.image_period = max(cycle, device.cycle)
@@ -218,18 +216,18 @@ class EmulatedDrives(Saved):
     def record(self, objects: ObjectNames, duration: float, play: Rows = None, period: float = 0.001) -> Trace:
         """Let `duration` [s] pass while objects are recorded and played.
 
-        Cycle k: row k of `play` is written, then row k is recorded, then one communication cycle passes. In csp and
-        csv every row is a set-point that arrives, also one that repeats the last.
+        Cycle k: row k of `play` is written, then row k is recorded, then one communication cycle passes. In csp and csv
+        every row counts as a new set-point, even if it repeats the last one.
 
         Args:
-            objects: What to record: one object, or several.
+            objects: The objects to record: one, or several.
             duration: Whole communication cycles [s].
             play: Object -> integers to write, shape (cycles,) or (cycles, num_axes).
             period: Time between samples [s], whole communication cycles.
 
         Raises:
             ObjectAccessError: For an object that cannot be recorded or played, or a value out of range.
-            ValueError: For times that are no whole cycles, or rows that do not fit.
+            ValueError: For times that are not whole cycles, or rows of a wrong shape.
         """
         cycles = self.inside.cycles(duration)
         every = self.inside.cycles(period)
@@ -289,14 +287,14 @@ class EmulatedDrives(Saved):
 
     # --- states ---------------------------------------------------------------------------------------------------
     def save_state(self) -> State:
-        """Return all that drives and machines go on from, bit by bit, as plain data that pickles."""
+        """Return the complete state of drives and machines, bit by bit, as plain data that can be pickled."""
         return {
             "of": self._description(),
             "groups": [group.load.save_state() for group in self.inside.groups],
         } | super().save_state()
 
     def restore_state(self, state: State) -> None:
-        """Put drives and machines back to a state that such drives have saved, these or others that were made alike.
+        """Restore drives and machines to a state saved by these drives or by others created alike.
 
         Raises:
             ValueError: For a state of other drives, naming what differs.
@@ -316,7 +314,7 @@ class EmulatedDrives(Saved):
         }  # fmt: skip
 
     def close(self) -> None:
-        """Give the threads back; the drives cannot be used afterwards."""
+        """Release the threads; the drives cannot be used afterwards."""
         if self._executor is not None:
             self._executor.shutdown()
             self._executor = None
@@ -337,7 +335,7 @@ class EmulatedDrives(Saved):
         given: Mapping[str, ArrayLike],
         wired_as_known: bool,
     ) -> tuple[dict[str, MachineParameter], dict[str, Floats], Floats]:
-        """Return the rows of the machines' parameters, their values, and the state from which each axis' noise goes."""
+        """Return the rows of the machines' parameters, their values, and the seed of each axis' noise."""
         axes = (1, self.load.num_axes)
         single = PackedLoad(self.load, np.ones(axes), np.zeros((*axes, 4)), {}, 1e-6)
         defaults = {p.name: float(single.get(p.name)[0]) for p in self.load.parameters}
@@ -349,7 +347,7 @@ class EmulatedDrives(Saved):
             check_known(name, table)
             values[name] = np.broadcast_to(np.asarray(value, float), (self.num_machines,)).copy()
             check_parameter(name, values[name])
-        return table, values, np.mod(seeds, 2.0**32 - 1.0) + 1.0  # xorshift stays at 0 for ever
+        return table, values, np.mod(seeds, 2.0**32 - 1.0) + 1.0  # xorshift would stay at 0 for ever
 
     # --- time -----------------------------------------------------------------------------------------------------
     def _run(self, cycles: int, call: Call) -> None:
@@ -393,7 +391,7 @@ class EmulatedDrives(Saved):
 
 
 def emulated_of(drives: Drives) -> EmulatedDrives:
-    """Return the emulated drives behind drives, without who looks at them; ValueError for drives of a bus."""
+    """Return the emulated drives behind drives, without observers; ValueError for drives on a bus."""
     found = machine_of(drives).drives
     assert isinstance(found, EmulatedDrives), "nothing else has a machine"
     return found

@@ -16,7 +16,7 @@ from mechanics.packed import PackedLoad
 
 
 class Channels(NamedTuple):
-    """Fields that a run plays or records: kind and index of lane 0, each of shape (objects,)."""
+    """Fields that a run plays or records: type and index of lane 0, each of shape (objects,)."""
 
     kinds: Integers
     offsets: Integers
@@ -45,7 +45,7 @@ def rates_of(device: Device, physics_steps: int) -> cycle.Rates:
         ValueError: If the device's rates are not whole multiples of each other or there are too many steps.
     """
     ticks = round(device.current_rate / device.velocity_rate)
-    # Step s covers the s-th part of the window; a tick that straddles two gives each its share.
+    # Step s covers the s-th part of the window; a tick across two steps gives each its share.
     edges = np.linspace(0.0, ticks, physics_steps + 1)
     start, end = edges[:-1, None], edges[1:, None]
     tick = np.arange(ticks)
@@ -67,9 +67,9 @@ def rates_of(device: Device, physics_steps: int) -> cycle.Rates:
 
 
 def with_cycle(device: Device, cycle: float) -> Device:
-    """Return a device with a shorter communication cycle [s]; its own, or a longer one, leaves it as it is.
+    """Return a device with a shorter communication cycle [s]; unchanged for a cycle that is not shorter.
 
-    The drive supervises itself once in each such cycle, and its velocity loop has the nearest lower rate that fits.
+    The drive's supervision runs once in each such cycle, and its velocity loop has the nearest lower rate that fits.
     """
     rate = 1.0 / cycle
     if rate < device.communication_rate * (1.0 + 1e-9):

@@ -1,4 +1,4 @@
-"""Warnings of machines that their motors cannot move, or only badly, with the figures."""
+"""Warnings about machines that their motors cannot move, or only badly, with the figures."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MAX_INERTIA_RATIO = 30.0
 
 
 class MisfitWarning(UserWarning):
-    """A machine asks more of its motor than it can give."""
+    """A machine demands more of its motor than it can give."""
 
 
 def warn_of_misfits(loads: Sequence[PackedLoad], motor: Motor, device: Device) -> None:

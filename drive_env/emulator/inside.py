@@ -1,4 +1,4 @@
-"""What is inside emulated drives: how machines, faults, tools and tests look there, and change what they must."""
+"""Access to the inside of emulated drives for machines, faults, tools and tests, which read and change it."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ from mechanics.model import copies_per_model
 from mechanics.packed import pack
 
 SWITCHES = ("left", "right", "home")  # bits of 60FDh
-LINK_FIELD = "link_shared"  # of firmware whose axes 2k and 2k + 1 may have one DC link
+LINK_FIELD = "link_shared"  # of firmware in which axes 2k and 2k + 1 may share a DC link
 BRAKE_TORQUE = 2.0  # of the motor's rated torque, usual for holding brakes
 
 
 class Inside(Saved):
-    """The truth inside emulated drives, which no drive shows on a bus.
+    """The true state inside emulated drives, which no drive shows on a bus.
 
     Args:
-        device: What the drives are.
-        motor: What each of them turns.
-        load: What each machine is a copy of.
-        parameter_rows: What each parameter of a machine is, by name.
+        device: The drives' device.
+        motor: The motor of each drive.
+        load: The load of each machine.
+        parameter_rows: Description of each parameter of a machine, by name.
         parameters: True parameters by name [SI], each of shape (num_machines,).
-        noise_seeds: State from which each axis' noise goes on, shape (num_axes,).
+        noise_seeds: Seed of each axis' noise, shape (num_axes,).
 
     Attributes:
         records: The drives' records, each of eight lanes, shape (blocks,); `get_lanes` and `set_lanes` read and write
@@ -47,13 +47,13 @@ class Inside(Saved):
         groups: The machines, in groups with a packed load each.
         objects: The object dictionary of every axis.
         cycle: Communication cycles since the beginning.
-        schedule: Parameters that are to change: (cycle, name, values, machines), the next one first.
-        reported: Which machines are known to have left physics, shape (num_machines,).
+        schedule: Scheduled changes of parameters: (cycle, name, values, machines), the next one first.
+        reported: Which machines were reported to have diverged, shape (num_machines,).
     """
 
     STATE = ("objects", "parameters", "noise_seeds", "cycle", "schedule", "reported")
 
-    objects: LiveDictionary  # of drives that are commissioned
+    objects: LiveDictionary  # for commissioned drives
 
     def __init__(
         self,
@@ -77,7 +77,7 @@ class Inside(Saved):
 
     # --- construction ---------------------------------------------------------------------------------------------
     def build_groups(self, physics_steps: int, integrator: str, friction: str) -> None:
-        """Make the machines, packed in groups; arguments as `EmulatedDrives` takes them."""
+        """Build the machines, packed in groups; arguments as for `EmulatedDrives`."""
         self._longest_step = 1.0 / (self.device.velocity_rate * physics_steps)
         rates = rates_of(self.device, physics_steps)
         per_group = copies_per_model(self.load, self.num_machines)
@@ -90,7 +90,7 @@ class Inside(Saved):
             copies=per_group,
             integrator=integrator,
             friction=friction,
-            # A joint does not go far in a millisecond, and sliding friction does not depend on inertia.
+            # A joint does not move far in a millisecond, and sliding friction does not depend on inertia.
             weigh_every=rates.windows * physics_steps,
         )
         first = 0
@@ -101,20 +101,20 @@ class Inside(Saved):
             first = machines.stop
 
     def change_rates(self, device: Device) -> None:
-        """Let time go on at the rates of a device that differs in these alone; what is scheduled keeps its times."""
+        """Continue at the rates of a device that differs only in these; scheduled changes keep their times."""
         longer = device.cycle / self.device.cycle
         self.device = device
         self.schedule = [
             (self.cycle + math.ceil((due - self.cycle) / longer - 1e-9), name, values, where)
             for due, name, values, where in self.schedule
         ]
-        # A step that is no longer than before leaves no resonance too fast for it.
+        # A step that is not longer than before keeps every resonance stable.
         rates = rates_of(device, math.ceil(1.0 / (device.velocity_rate * self._longest_step) - 1e-9))
         for group in self.groups:
             group.machinery.rates.replace(**{row.name: getattr(rates, row.name) for row in dataclasses.fields(rates)})
             group.load.set_step(rates.window / rates.substeps, rates.windows * rates.substeps)
         self.refresh_inertia()
-        axes, name = np.ones(self.num_axes, bool), "stage.velocity_filter"  # its coefficients are those of a rate
+        axes, name = np.ones(self.num_axes, bool), "stage.velocity_filter"  # its coefficients depend on the rate
         self._apply_to_records(name, np.repeat(self.parameters[name], self.load.num_axes), axes)
 
     def _set_constants(self, supply: float) -> None:
@@ -140,7 +140,7 @@ class Inside(Saved):
         self.set_noise(np.ones(self.num_axes, bool))
 
     def apply_what_was_drawn(self, supply: float) -> None:
-        """Give the records what machines, motor and supply [V] are."""
+        """Write the properties of machines, motor and supply [V] into the records."""
         self._set_constants(supply)
         for name, values in self.parameters.items():
             everywhere = np.ones(self.num_axes, bool)
@@ -166,7 +166,7 @@ class Inside(Saved):
     # --- what the machines are --------------------------------------------------------------------------------------
     @property
     def links(self) -> Integers:
-        """Which DC link each axis has, shape (num_axes,): the number of the first axis that has it."""
+        """DC link of each axis, shape (num_axes,): the number of the first axis on it."""
         axes = np.arange(self.num_axes)
         if not self.device.firmware.layout.has(LINK_FIELD):
             return axes
@@ -174,19 +174,19 @@ class Inside(Saved):
         return np.where(shared > 0.5, axes - axes % 2, axes)
 
     def cycles(self, duration: float) -> int:
-        """Return how many communication cycles a time [s] has.
+        """Return the number of communication cycles in a time [s].
 
         Raises:
-            ValueError: If it is no time, or no whole number of them.
+            ValueError: If it is not a time, or not a whole number of cycles.
         """
         return whole_cycles(duration, self.device.cycle)
 
     def connect_axes(self, first: int, number: int) -> None:
-        """Let machines of one axis each share what axes of one drive do, as a DC link: as on a node.
+        """Make machines of one axis each share what the axes of one drive share, e.g. a DC link.
 
         Args:
             first: The drive's first axis.
-            number: Its axes that turn a machine.
+            number: Number of its axes with a machine.
 
         Raises:
             ValueError: If they share a DC link, and their machines have different supplies.
@@ -196,7 +196,7 @@ class Inside(Saved):
             self._kind.connect(self.records, self.device, (axes >= first) & (axes < first + number))
 
     def set_switches(self, kind: str, held: Mask) -> None:
-        """Wire the switches of a kind: the load presses them where its row says, or everywhere those that are held."""
+        """Set the switches of a kind: pressed by the load as in its row; `held` ones are always pressed."""
         for switch in self.load.switches:
             if switch.kind == kind:
                 axes = np.tile(np.arange(self.load.num_axes) == switch.axis, self.num_machines)
@@ -207,12 +207,12 @@ class Inside(Saved):
                 set_lanes(self.records, "wired", wired | (1 << number), axes)
 
     def set_noise(self, axes: Mask) -> None:
-        """Let the noise of axes begin anew, where their firmware has any."""
+        """Restart the noise of axes, if their firmware has noise."""
         if self._kind.noise:
             set_lanes(self.records, self._kind.noise, self.noise_seeds, axes)
 
     def _apply_to_records(self, name: str, values: Floats, axes: Mask) -> bool:
-        """Write a motor or stage parameter into the records; return False for one that is the mechanics'."""
+        """Write a motor or stage parameter into the records; return False for one of the mechanics."""
         if (write := self._kind.writes.get(name)) is None:
             return False
         write(self.records, self.device, self.motor, values, axes)
@@ -222,13 +222,13 @@ class Inside(Saved):
         return np.repeat(self.parameters["motor.inertia"][:, None], self.load.num_axes, 1)
 
     def _bearings(self) -> Floats:
-        """Return the motors' friction; their breakaway is that of sliding, so Stribeck's speed does not matter."""
+        """Return the motors' friction; breakaway equals sliding friction, so Stribeck's speed does not matter."""
         coulomb, viscous = self.parameters["motor.coulomb"], self.parameters["motor.viscous"]
         one = np.stack([coulomb, coulomb, np.ones_like(coulomb), viscous], -1)
         return np.repeat(one[:, None, :], self.load.num_axes, 1)
 
     def apply_parameter(self, name: str, values: Floats, machines: Mask) -> None:
-        """Bring a true parameter into records and mechanics; a refused one changes nothing."""
+        """Write a true parameter into records and mechanics; a refused one changes nothing."""
         axes_per_machine = self.load.num_axes
         axes = np.repeat(machines, axes_per_machine)
         if self._apply_to_records(name, np.repeat(values, axes_per_machine), axes):
@@ -243,7 +243,7 @@ class Inside(Saved):
         self.refresh_inertia()
 
     def apply_parameters(self, values: Mapping[str, Floats], machines: Mask) -> None:
-        """Bring several true parameters into records and mechanics, and remember them; a refusal leaves a mixture."""
+        """Write several true parameters into records and mechanics, and store them; a refusal leaves some changed."""
         axes_per_machine = self.load.num_axes
         axes = np.repeat(machines, axes_per_machine)
         self.parameters |= values
@@ -274,7 +274,7 @@ class Inside(Saved):
                 group.load.set_motor(armature[group.machines], bearings[group.machines])
 
     def refresh_inertia(self) -> None:
-        """Tell the rotors what they turn, after a load was changed."""
+        """Update the rotors' total inertia after a change of load."""
         axes = self.load.num_axes
         inertia = np.concatenate([group.load.plant.mass[:axes].T.reshape(-1) for group in self.groups])
         set_lanes(self.records, "J_rotor", inertia)

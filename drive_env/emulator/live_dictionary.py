@@ -1,4 +1,4 @@
-"""The object dictionary of emulated drives, alive: its values are the fields of their records.
+"""The live object dictionary of emulated drives: its values are the fields of their records.
 
 Reading and writing check type, access, range and state exactly as the bus does; the error carries the SDO abort code.
 """
@@ -52,11 +52,11 @@ class LiveDictionary:
     """Objects of all axes.
 
     Args:
-        device: Whose dictionary it is.
+        device: The device.
         records: The axes' records.
         num_axes: Number of axes.
-        preset: Object name -> raw value, written after the factory values; both are what a restart restores. The
-            records have them from the first restart on.
+        preset: Object name -> raw value, written after the factory values; a restart restores both. The records have
+            them from the first restart on.
     """
 
     def __init__(
@@ -69,9 +69,9 @@ class LiveDictionary:
             RATIO_FIELD: velocity_ratio(device.roles),
             SET_POINT_FIELD: set_point_ratio(device.roles),
         }
-        # Fields of scales that objects make, as far as the device has them.
+        # Fields of scales that are made of objects, if the device has them.
         self._scales: dict[str, PositionScale] = {name: scale for name, scale in found.items() if scale is not None}
-        # Objects whose write gives what is stored another meaning.
+        # Objects whose write changes the meaning of stored values.
         self.scale_keys = tuple(key for scale in self._scales.values() for key in scale.keys)
         self._single_scales = {
             field: device.roles[role]
@@ -83,7 +83,7 @@ class LiveDictionary:
             if role in device.roles
         }
         self.scale_keys += tuple(self._single_scales.values())
-        # Fields besides that of positions on which factors of this device's units depend.
+        # Further fields, besides that of positions, on which factors of this device's units depend.
         self.other_scales = tuple(name for name in (*self._scales, *self._single_scales) if name != SCALE_FIELD)
         self._position_keys = self._scales[SCALE_FIELD].keys if SCALE_FIELD in self._scales else ()
         self.codes = {key: code_of(self.entries.find(key), binding) for key, binding in device.bindings.items()}
@@ -92,19 +92,19 @@ class LiveDictionary:
         self._records = records
         self.num_axes = num_axes
         self._scale_changes = 0
-        self._snapshot: RecordSnapshot | None = None  # of what a restart restores
+        self._snapshot: RecordSnapshot | None = None  # of the values that a restart restores
         self._values: dict[tuple[int, int], Integers | str] = {}
-        # What the node of an axis told as its network took it into fault, 0: nothing; for 603Fh.
+        # Condition reported by an axis' node when its network took it into fault, 0: nothing; for 603Fh.
         self.network_codes: Integers = np.zeros(self.num_axes, np.int64)
         self._stored = self._commission(preset)
 
     def read(self, name: ObjectName) -> Integers:
         """Return an object of every axis, int64 of shape (num_axes,); a text as an array of str."""
-        if name is Role.POSITION_SCALE and len(self._position_keys) > 1:  # no object has it: several make it
+        if name is Role.POSITION_SCALE and len(self._position_keys) > 1:  # no single object has it: several form it
             return np.asarray(np.rint(self.context().position_scaler), np.int64)
         entry = self.entries.find(name)
         if entry.access == "wo" and (entry.index, entry.sub) == MODE_OF_OPERATION and self.entries.has(MODE_DISPLAY):
-            entry = self.entries.find(MODE_DISPLAY)  # which shows it (CiA 402)
+            entry = self.entries.find(MODE_DISPLAY)  # shows the mode (CiA 402)
         check_readable(entry)
         return self._read(entry)
 
@@ -117,12 +117,12 @@ class LiveDictionary:
         self._write(entry, raw, where)
 
     def impose(self, name: ObjectName, raw: ArrayLike) -> None:
-        """Set a read-only object that the firmware does not compute, from outside; the value's range is checked."""
+        """Set a read-only object that the firmware does not compute, e.g. an input; the value's range is checked."""
         entry = self.entries.find(name)
         self._set_value(entry, checked_values(entry, raw, self.num_axes), np.ones(self.num_axes, bool))
 
     def engrave(self, name: ObjectName, raw: ArrayLike, where: Mask | None = None) -> None:
-        """Set a read-only object for ever, a serial number for instance, of the axes where the mask is true.
+        """Set a read-only object permanently, e.g. a serial number, for the axes where the mask is true.
 
         Its range is checked.
         """
@@ -147,7 +147,7 @@ class LiveDictionary:
         self.device.firmware.power_on(self._records, axes)
 
     def save_state(self) -> dict[str, Any]:
-        """Return records, values beside them and stored values, as plain data."""
+        """Return records, other values and stored values, as plain data."""
         return {
             "records": self._records.view(np.uint8).copy(),
             "values": {key: value.copy() for key, value in self._values.items() if isinstance(value, np.ndarray)},
@@ -156,7 +156,7 @@ class LiveDictionary:
         }
 
     def restore_state(self, state: Mapping[str, Any]) -> None:
-        """Bring records and values of as many axes of the same device to a state of `save_state`."""
+        """Restore records and values of as many axes of the same device to a state of `save_state`."""
         before = self.context()
         self._records.view(np.uint8)[...] = state["records"]
         self._count_scale_change(before)
@@ -167,8 +167,7 @@ class LiveDictionary:
             self._snapshot = None
 
     def _count_scale_change(self, before: units.Context) -> None:
-        """Count a change if the scales are others than those of before."""
-        # The peak current of a drive that needs none is nan, and stays what it was.
+        # The peak current of a drive that does not need it is nan, and stays unchanged.
         after = self.context()
         if not all(np.array_equal(one, other, equal_nan=True) for one, other in zip(before, after, strict=True)):
             self._scale_changes += 1
@@ -179,7 +178,7 @@ class LiveDictionary:
         return self._records
 
     def unbound(self, entry: Entry) -> Integers | str:
-        """Return the values of an object that no field of the record is, one per axis, not a copy; or its text."""
+        """Return the values of an object that is not a field of the record, one per axis, not copied; or its text."""
         if self._is_error_code(entry):
             return self._error_codes(np.asarray(get_lanes(self._records, FAULT_FIELD, self.num_axes), np.int64))
         return self._values[entry.index, entry.sub]
@@ -189,7 +188,7 @@ class LiveDictionary:
         return {key: int(raw[axis if len(raw) > 1 else 0]) for key, raw in self._stored.items()}
 
     def store(self, axis: int, values: Mapping[tuple[int, int], int]) -> None:
-        """Set the values that a restart restores on one axis; those of existing objects, within their range."""
+        """Set the values that a restart restores on one axis: those of existing objects, limited to their range."""
         for key, raw in values.items():
             if len(self._stored[key]) < self.num_axes:
                 self._stored[key] = np.repeat(self._stored[key], self.num_axes)
@@ -197,9 +196,9 @@ class LiveDictionary:
         self._snapshot = None
 
     def part(self, entry: Entry, read: Callable[[Key], Integers] | None = None) -> Integers:
-        """Return an object that shows a part of another, whose values `read` returns, axes last; by default those now.
+        """Return an object that shows part of another, whose values `read` returns, axes last (default: present ones).
 
-        An axis of the node that is not there shows what the dictionary says.
+        An axis that the node lacks shows the dictionary's default.
         """
         part = self.device.parts[entry.index, entry.sub]
         read = read or (lambda key: self._read(self.entries.find(key)))
@@ -214,20 +213,20 @@ class LiveDictionary:
         return np.asarray(np.where(there, shown, entry.default), np.int64)
 
     def write_checked(self, entry: Entry, raw: int, axis: int) -> None:
-        """Write an object of one axis that was checked before."""
+        """Write an already checked value to an object of one axis."""
         where = np.zeros(self.num_axes, bool)
         where[axis] = True
         self._write(entry, np.full(self.num_axes, raw, np.int64), where)
 
     @property
     def scale_changes(self) -> int:
-        """How often the scale of positions has been written, on whatever axis."""
+        """Number of writes of the position scale, on any axis."""
         return self._scale_changes
 
     def prepared_record(self, sampled: Sequence[ObjectName], played: Sequence[ObjectName]) -> PreparedRecord | None:
-        """Return the prepared form of a repeated call of `record`, None if an object needs the long way.
+        """Return the prepared form of a repeated call of `record`; None if an object cannot be prepared.
 
-        The call was made before, so that everything was found that could be refused but values.
+        The call was made before, so all checks except those of values have passed.
         """
         entries = [self.entries.find(name) for name in sampled]
         inputs = [self.entries.find(name) for name in played]
@@ -256,7 +255,7 @@ class LiveDictionary:
         )
 
     def recordable(self, entry: Entry) -> Code | None:
-        """Return where the value of an entry is that changes by itself, None for one that only a write changes."""
+        """Return the conversion of an object whose value changes by itself; None for one that only writes change."""
         check_readable(entry)
         key = (entry.index, entry.sub)
         if key in self.device.parts:
@@ -266,7 +265,7 @@ class LiveDictionary:
         return self.codes.get(key)
 
     def recorded(self, entry: Entry, code: Code, values: Floats) -> Integers:
-        """Return an object's integers of recorded SI values, from the place that `recordable` has for it; axes last."""
+        """Return an object's integers of recorded SI values, by the conversion from `recordable`; axes last."""
         raw = self.to_od(code, values)
         if self._is_error_code(entry):
             return self._error_codes(raw)
@@ -276,8 +275,8 @@ class LiveDictionary:
         """Return SI values, shape (cycles, objects, num_axes), and the fields that they go to.
 
         Raises:
-            ObjectAccessError: For an object that cannot be played or a value that it cannot have.
-            ValueError: For rows that do not fit.
+            ObjectAccessError: For an object that cannot be played, or an impossible value.
+            ValueError: For rows of a wrong shape.
         """
         values = np.empty((cycles, len(play), self.num_axes))
         fields: list[tuple[str, int]] = []
@@ -303,14 +302,14 @@ class LiveDictionary:
 
     # --- inside ---------------------------------------------------------------------------------------------------
     def _commission(self, preset: Mapping[ObjectName, int]) -> dict[tuple[int, int], Integers]:
-        """Return the raw values that a restart restores, factory values and then the preset; one of all axes each."""
+        """Return the raw values that a restart restores, factory values and preset; one for all axes each."""
         numbers: list[Entry] = []
         for entry in self.entries:
             if isinstance(entry.default, str):
                 self._values[entry.index, entry.sub] = entry.default
             else:
                 numbers.append(entry)
-        # Some hundreds of objects in one array: one by one they would take most of a set's construction.
+        # Hundreds of objects in one array: one by one they would take most of the time of construction.
         factory = np.array([entry.default for entry in numbers], np.int64)
         stored: dict[tuple[int, int], Integers] = {
             (entry.index, entry.sub): factory[k : k + 1] for k, entry in enumerate(numbers)
@@ -331,7 +330,7 @@ class LiveDictionary:
             self._check_value(entry, raw)
             stored[entry.index, entry.sub] = raw.copy()
             axis, base = self.device.locate(entry.index)
-            if axis and (base, entry.sub) in stored:  # of the second axis of each drive alone, say
+            if axis and (base, entry.sub) in stored:  # say, only of the second axis of each drive
                 values_of_axes = np.resize(stored[base, entry.sub], self.num_axes)
                 values_of_axes[axis :: self.device.num_axes] = raw
                 stored[base, entry.sub] = values_of_axes
@@ -343,7 +342,7 @@ class LiveDictionary:
         return stored
 
     def _defaults(self, entry: Entry, step: int) -> Integers:
-        """Return an axis object's factory value, one of all axes, or one per axis where those of a node differ."""
+        """Return an axis object's factory value: one for all axes, or one per axis if those of a node differ."""
         keys = [(entry.index + k * step, entry.sub) for k in range(self.device.num_axes)]
         found = [self.entries.find(key).default if self.entries.has(key) else entry.default for key in keys]
         if len(set(found)) == 1:
@@ -353,8 +352,8 @@ class LiveDictionary:
     def _stored_snapshot(self) -> RecordSnapshot:
         """Return the fields that a restart sets from stored values, converted by the stored scales.
 
-        Fields that the firmware computes are left out; a parameter that cannot be written is fixed.
-        An object that only shows what another sets has no say.
+        Fields computed by the firmware are left out; read-only parameters are included. Objects that only show a field
+        are ignored.
         """
         length = max(map(len, self._stored.values()))
         context = self.context()
@@ -392,7 +391,7 @@ class LiveDictionary:
         return (entry.index, entry.sub) in self.codes
 
     def context(self) -> units.Context:
-        """Return the values that the factors of units depend on now, one per axis."""
+        """Return the present values that units' factors depend on, one per axis."""
         of_axes: dict[str, Any] = {name: self._scale_field(name) for name in (SCALE_FIELD, *self.other_scales)}
         return units.Context(
             **of_axes, current_lsb=self.device.current_full_scale / 32768.0, rated_current=self.device.rated_current
@@ -416,7 +415,7 @@ class LiveDictionary:
         return (entry.index, entry.sub) == ERROR_CODE and not self._is_bound(entry)
 
     def _error_codes(self, faults: Integers) -> Integers:
-        """Return 603Fh: the emergency code of the fault that an axis is in, 0 without a fault; axes last."""
+        """Return 603Fh: the emergency code of an axis' fault, 0 without a fault; axes last."""
         codes = np.zeros(faults.shape, np.int64)
         for row in np.unique(faults[faults > 0]):
             emergency = self.device.emergencies[self.device.firmware.causes[int(row) - 1].name]
@@ -427,7 +426,7 @@ class LiveDictionary:
         return codes
 
     def to_od(self, code: Code, value: Floats) -> Integers:
-        """Return integers on the wire of SI values; axes are the last dimension."""
+        """Convert SI values to integers on the bus; axes are the last dimension."""
         return encode(code, value, code.factor(self.context()))
 
     def _from_od(self, code: Code, raw: NDArray[Any], context: units.Context | None = None) -> Floats:
@@ -472,7 +471,7 @@ class LiveDictionary:
                 is_whole = np.full(self.num_axes, event == cycle.WHOLE_SET_POINT, np.int32)
                 set_lanes(self._records, "target_is_whole", is_whole, where)
         elif event >= 0:
-            # Copies: of arrays that cannot be written, or with gaps, the kernel would be compiled once more.
+            # Copies: for read-only arrays, or arrays with gaps, the kernel would be compiled once more.
             self.device.firmware.write_events(self._records, event, np.array(raw, np.int64), np.array(where, bool))
         else:
             self._set_field(entry, raw, where)
@@ -519,9 +518,9 @@ class LiveDictionary:
         self._values[key] = raw.copy() if before is None else np.where(where, raw, before)
 
 
-# --- what the device allows, the same for a set of axes and for the one axis of a node --------------------------------
+# --- what the device allows, for all axes and for the one axis of a node ---------------------------------------------
 def check_supported(device: Device, entry: Entry) -> None:
-    """Raise 08000020h for an object whose write would need a service that is not there, with the reason."""
+    """Raise 08000020h, with the reason, for an object whose write needs a missing service."""
     reason = device.unsupported.get((entry.index, entry.sub))
     if reason is not None:
         without = f"{entry.label} has no service behind it in this emulator"
@@ -529,7 +528,7 @@ def check_supported(device: Device, entry: Entry) -> None:
 
 
 def allowed_values(device: Device, entry: Entry) -> tuple[int, ...] | None:
-    """Return the few values that an object knows, None if it takes its whole range."""
+    """Return the allowed values of an object that has only a few, None if its whole range is allowed."""
     if (entry.index, entry.sub) == MODE_OF_OPERATION:
         known = device.allowed_values.get(MODE_OF_OPERATION)
         return tuple(mode.number for mode in MODES if known is None or mode.number in known)

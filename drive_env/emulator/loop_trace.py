@@ -1,7 +1,7 @@
 """Traces between two communication cycles of emulated drives: signals at the rate of the velocity loop.
 
-No bus carries this; a real drive of this kind shows its loops once a millisecond. The machines run exactly as they do
-otherwise, to the bit: a cycle is run as windows, and only the first of them does what the drive does once a cycle.
+This is not available on a bus; a real drive of this kind shows its loops once a millisecond. The machines run bit by
+bit as otherwise: a cycle is run as windows, and only the first one includes the drive's work per cycle.
 """
 
 from __future__ import annotations
@@ -24,8 +24,7 @@ if TYPE_CHECKING:
     pass
 
 
-# Signal -> unit; fields of the drive's record (firmware/record.py), as they are at a window's start. A drive has
-# those that its firmware has.
+# Signal -> unit; fields of the drive's record (firmware/record.py) at the start of a window, if the firmware has them.
 SIGNALS = {
     "position_demand": "rad",
     "theta_meas": "rad",
@@ -51,13 +50,13 @@ def trace_loops(
 ) -> LoopTrace:
     """Let `duration` [s] pass while signals are sampled at the start of every window of the velocity loop.
 
-    Sample 5 k (with five windows a cycle) is what `record` has in row k: what the last cycle left behind.
+    Sample 5 k (with five windows a cycle) equals row k of `record`: the state after the last cycle.
 
     Args:
-        drives: Emulated drives; on a bus no such trace exists.
+        drives: Emulated drives; not available on a bus.
         signals: Names of `SIGNALS`.
         duration: Whole communication cycles [s].
-        play: As `record` takes it, one row per communication cycle.
+        play: As for `record`, one row per communication cycle.
 
     Raises:
         ValueError: For drives on a bus, an unknown signal, or a time that is not a whole number of cycles.
@@ -65,7 +64,7 @@ def trace_loops(
     """
     if drives.machine is None:
         raise ValueError("drives on a bus show their loops once per communication cycle only; use record()")
-    emulated = emulated_of(drives)  # whatever looks at them does not see this time pass
+    emulated = emulated_of(drives)  # observers do not notice this time
     fields = emulated.device.firmware.layout.dtype.names or ()
     known = [name for name in SIGNALS if name in fields]
     for name in signals:
@@ -83,7 +82,7 @@ def trace_loops(
     nothing = np.empty((windows, 0, emulated.num_axes))
     begin, diverged = emulated.inside.cycle, False
     try:
-        # Each window as if it were a cycle.
+        # Each window is run as if it were a cycle.
         for one in rates:
             one.replace(windows=1, periods=1)
         for k in range(cycles):
@@ -94,7 +93,7 @@ def trace_loops(
                 first = (np.ascontiguousarray(values[k : k + 1]), played) if p == 0 else (nothing, NOTHING)
                 call = call_of(*first, samples[k, p, :1], sampled, 1)
                 diverged |= emulated._run_groups(call, 0, 1, True, True)
-                # A lane that is not alive is computed as ever, and left out of what happens once a period.
+                # A lane that is not alive is computed as always, and left out of the work done once a period.
                 set_lanes(emulated.inside.records, "live", np.zeros(emulated.num_axes, np.int32))
                 for one in rates:
                     one.replace(period=0.0)

@@ -1,6 +1,6 @@
 """The emulated machines' side that no bus shows: true parameters, disturbances, supply, power.
 
-A task may use it to make a world, never to act; `drives.machine` is None on a real drive.
+A task may use it to set up a world, never to act; `drives.machine` is None on a real drive.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 INPUTS_FIELD = "inputs_set"  # of firmware that has general inputs
 ERRORS_FIELD = "error_bits"  # of firmware with a table of numbered errors
-# Of drives with two axes: outputs of an axis, which is every second one, and where they are in the native control.
+# Drives with two axes: outputs of an axis (every second one), and their place in the native control.
 AXES, AXIS_OUTPUTS, NATIVE_OUTPUTS = 2, 3, 28
 INPUTS_SHIFT = 16  # general inputs and outputs are bits 16 to 23 of their objects
 AFTER_POWER_ON = ("blinking", "off")  # of the run lamp and the error lamp
@@ -39,7 +39,7 @@ _BRAKES = ("open", "closed", "with_stage", "output")  # numbers of firmware/comm
 
 
 def checked_supply(value: ArrayLike, num_axes: int) -> Floats:
-    """Return the supply voltage of each axis [V], shape (num_axes,); ValueError for one that cannot be."""
+    """Return the supply voltage of each axis [V], shape (num_axes,); ValueError for an impossible one."""
     volts = np.broadcast_to(np.asarray(value, float), (num_axes,))
     bad = ~np.isfinite(volts) | (volts < 0.0)
     if np.any(bad):
@@ -48,11 +48,11 @@ def checked_supply(value: ArrayLike, num_axes: int) -> Floats:
 
 
 class Machines:
-    """The emulated machines behind drives: one value per machine, shape (num_machines,), unless said otherwise.
+    """The emulated machines behind drives: one value per machine, shape (num_machines,), unless stated otherwise.
 
     Attributes:
         drives: The drives that turn these machines.
-        inside: What is inside them.
+        inside: The inside of the drives.
     """
 
     def __init__(self, drives: Drives, inside: Inside, faults: MachineFaults) -> None:
@@ -60,11 +60,11 @@ class Machines:
         self.inside = inside
         self._faults = faults
         self._rest: RecordSnapshot | None = None  # state of a machine at rest
-        self._lamps: list[tuple[slice, Callable[[], tuple[str, str]]]] = []  # of nodes: their axes, what they show
+        self._lamps: list[tuple[slice, Callable[[], tuple[str, str]]]] = []  # of nodes: axes, patterns
 
     @property
     def load(self) -> Load:
-        """What each machine is a copy of."""
+        """The load of each machine."""
         return self.inside.load
 
     @property
@@ -74,12 +74,12 @@ class Machines:
 
     @property
     def parameter_rows(self) -> Mapping[str, MachineParameter]:
-        """What each parameter is by name: unit, default, and the range in which random machines have it."""
+        """Description of each parameter by name: unit, default, and range for random machines."""
         return self.inside.parameter_rows
 
     @property
     def diverged(self) -> Mask:
-        """Which machines left physics and are frozen, shape (num_machines,)."""
+        """Which machines have diverged and are frozen, shape (num_machines,)."""
         return np.concatenate([group.load.plant.diverged != 0 for group in self.inside.groups])
 
     @property
@@ -95,17 +95,17 @@ class Machines:
 
     @contextmanager
     def pushed(self) -> Iterator[Callable[[ArrayLike], None]]:
-        """Give a function that puts torques on the axes besides `load_torque`, which alone acts again at the end.
+        """Yield a function that puts torques on the axes in addition to `load_torque`, until the block ends.
 
-        It takes torques as the rotors see them [N*m], shape (num_axes,), one after the other; the load's joints that no
-        axis turns feel nothing of them.
+        It is called with torques at the rotors [N*m], shape (num_axes,); joints of the load that no axis turns are not
+        affected.
         """
         from mechanics.shaft import way
 
         groups = self.inside.groups
         before = [(group.load.plant.disturbance.copy(), group.load.plant.load_torque.copy()) for group in groups]
         turning = way(groups[0].load).joints
-        onto = np.linalg.pinv(turning)  # forces at the joints of a torque at each rotor
+        onto = np.linalg.pinv(turning)  # joint forces for a torque at each rotor
 
         def push(torque: ArrayLike) -> None:
             each = np.broadcast_to(np.asarray(torque, float), (self.inside.num_axes,)).reshape(-1, len(turning))
@@ -123,13 +123,13 @@ class Machines:
     def load_profile(
         self, at: ArrayLike | None, torque: ArrayLike | None = None, *, of: str = "time", period: float | None = None
     ) -> None:
-        """Add a torque from a table to `load_torque`, interpolated linearly, in all machines; None takes it away.
+        """Add a torque from a table to `load_torque`, interpolated linearly, in all machines; None removes it.
 
         Args:
             at: Times from now [s], or positions of the first axis's joint or carriage [rad or m]; increasing, (n,).
             torque: On the load [N*m; N where the load moves in a line], shape (n,) or (num_machines, n).
             of: "time" or "position".
-            period: After which the table begins anew; without one the first and last values hold outside.
+            period: Period after which the table repeats; None: the first and last values hold outside.
 
         Raises:
             ValueError: For an invalid table; nothing is changed then.
@@ -153,16 +153,16 @@ class Machines:
             group.load.set_profile(points, rows[group.machines], of_position=of == "position", period=period or 0.0)
 
     def schedule(self, name: str, times: ArrayLike, values: ArrayLike, where: Mask | None = None) -> None:
-        """Let a parameter change while time passes: a payload that is picked up, a supply line that warms.
+        """Schedule changes of a parameter, e.g. a payload that is picked up, or a supply line that warms.
 
         Args:
             name: A parameter, as in `set`.
             times: Times from now [s], whole communication cycles, shape (n,).
-            values: What the parameter becomes then [SI], shape (n,) or (n, num_machines).
+            values: Its new values [SI], shape (n,) or (n, num_machines).
             where: Machines.
 
         Raises:
-            ValueError: As in `set`, at once, and for times that are past or no whole cycles.
+            ValueError: As in `set`, at once, and for times that are past or not whole cycles.
         """
         inside = self.inside
         check_known(name, inside.parameters)
@@ -181,11 +181,11 @@ class Machines:
 
     @property
     def brake(self) -> NDArray[np.str_]:
-        """Holding brake of each axis: "open", "closed", "with_stage" or "output"; set likewise.
+        """Holding brake of each axis: "open", "closed", "with_stage" or "output"; can be set.
 
-        With the stage it is closed while that is off. At the drive's output a spring closes it, and the output's
-        current opens it, each after its time (`motor.brake_closes_in`, `motor.brake_opens_in`). Its torque is twice
-        the motor's rated torque: what holding brakes of this size are built for.
+        "with_stage": closed while the stage is off. "output": a spring closes it, and the current of the drive's output
+        opens it, each after its time (`motor.brake_closes_in`, `motor.brake_opens_in`). Its torque is twice the motor's
+        rated torque, as is usual for holding brakes of this size.
         """
         return np.array([_BRAKES[int(mode)] for mode in self._axis_field("brake_mode")])
 
@@ -201,7 +201,7 @@ class Machines:
 
     @property
     def brake_output(self) -> Floats:
-        """Current of each axis' brake output, as a share of its largest, shape (num_axes,); 0 without an output."""
+        """Current of each axis' brake output, as a share of the maximum, shape (num_axes,); 0 without an output."""
         return self._axis_field("brake_output")
 
     @property
@@ -210,7 +210,7 @@ class Machines:
         return np.concatenate([group.load.joint_positions() for group in self.inside.groups])
 
     def place(self, joint: int, angles: ArrayLike, where: Mask | None = None) -> None:
-        """Put a joint that no drive turns to another position, at rest.
+        """Move a joint that no drive turns to another position, at rest.
 
         Args:
             joint: Number of the joint, as in `joint_positions`.
@@ -239,7 +239,7 @@ class Machines:
 
     @property
     def links(self) -> Integers:
-        """Which DC link each axis has, shape (num_axes,): the number of the first axis that has it."""
+        """DC link of each axis, shape (num_axes,): the number of the first axis on it."""
         return self.inside.links
 
     @property
@@ -259,18 +259,18 @@ class Machines:
 
     @property
     def switches(self) -> Integers:
-        """Inputs as the load presses them, bits of 60FDh, shape (num_axes,)."""
+        """Inputs pressed by the load or held, bits of 60FDh, shape (num_axes,)."""
         return self._axis_field("inputs").astype(np.int64)
 
     def press(self, kind: str, held: ArrayLike) -> None:
-        """Hold switches pressed from outside, wherever the load is; those that are let go are the load's again.
+        """Hold switches pressed regardless of the load; released ones follow the load again.
 
         Args:
             kind: "left", "right" or "home".
             held: One value or one per axis.
 
         Raises:
-            ValueError: For a kind of switch that an axis which it is held on does not have.
+            ValueError: For a kind of switch that one of the held axes lacks.
         """
         inside = self.inside
         pressed = np.broadcast_to(np.asarray(held, bool), (inside.num_axes,))
@@ -285,7 +285,7 @@ class Machines:
 
     @property
     def enable_input(self) -> Mask:
-        """Whether the enable input is closed, shape (num_axes,); set it to a value or one per axis."""
+        """Whether the enable input is closed, shape (num_axes,); can be set, to one value or one per axis."""
         return self._axis_field("enable_input") > 0
 
     @enable_input.setter
@@ -297,9 +297,9 @@ class Machines:
 
     @property
     def outputs(self) -> Integers:
-        """Digital outputs, bit 0 is GPO0: those that their mask lets through, shape (num_axes,).
+        """Digital outputs, bit 0 is GPO0: those that their mask enables, shape (num_axes,).
 
-        A drive whose axes have registers of their own for every second output sets and clears them by these, too.
+        A drive whose axes have separate registers for every second output also sets and clears them by these.
         """
         read, device = self.drives.read, self.inside.device
         pins = (1 << device.num_outputs) - 1
@@ -310,7 +310,7 @@ class Machines:
         return (set_ | self._of_both(own)) & ~self._of_both(read(Role.OUTPUTS_CLEAR)) & pins
 
     def _of_both(self, own: Integers) -> Integers:
-        """Return the outputs of a module by those of its axes: the first has outputs 0, 2, 4, the second 1, 3, 5."""
+        """Combine the outputs of a module's axes: the first has outputs 0, 2, 4, the second 1, 3, 5."""
         count = self.inside.device.num_axes
         number = np.arange(len(own))
         spread = np.zeros(len(own), np.int64)
@@ -324,7 +324,7 @@ class Machines:
 
     @property
     def digital_inputs(self) -> Integers:
-        """Levels of the inputs that belong to no axis, bit 0 is IN0, shape (num_axes,); set them likewise, 0 to 255.
+        """Levels of the inputs that belong to no axis, bit 0 is IN0, shape (num_axes,); can be set, 0 to 255.
 
         A node with several axes shows those of its first one.
         """
@@ -344,7 +344,7 @@ class Machines:
 
     @property
     def analog_inputs(self) -> Integers:
-        """Readings of the analog inputs, 0...4095, shape (inputs, num_axes); set them likewise."""
+        """Readings of the analog inputs, 0...4095, shape (inputs, num_axes); can be set."""
         return np.stack([self.drives.read(key) for key in self._analog_inputs()])
 
     @analog_inputs.setter
@@ -361,10 +361,10 @@ class Machines:
 
     @property
     def drive_mode(self) -> Integers:
-        """The drive's own mode, shape (num_axes,), as its maker's service program sets it (the TGZ's D-Mode, 2303h).
+        """The manufacturer's mode, shape (num_axes,), as set by the maker's service program (D-Mode of the TGZ, 2303h).
 
-        Setting it is what such a program does beside a master: none of its frames is seen on the bus. The numbers are
-        the object's; ObjectAccessError for another one, and for a drive that has no such mode.
+        Setting it acts like that program: without frames on the bus. ObjectAccessError for a value that the object does
+        not allow, and for a drive without such a mode.
         """
         return self.drives.read(Role.MODE_GATE)
 
@@ -374,10 +374,10 @@ class Machines:
 
     @property
     def error_bits(self) -> Integers:
-        """Errors that are there whatever machine and drive do, shape (num_axes,); bit k is error k of the table.
+        """Forced errors, independent of machine and drive, shape (num_axes,); bit k is error k of the table.
 
-        Set them likewise; those that have a physical cause here come by it, too. ValueError for a bit that is not of
-        its errors, and on drives whose errors have no numbers.
+        Can be set; errors with a physical cause here occur by that, too. ValueError for a bit without an error, and for
+        drives whose errors have no numbers.
         """
         self._check_has_errors()
         return self._axis_field(ERRORS_FIELD).astype(np.int64)
@@ -402,10 +402,10 @@ class Machines:
 
     @property
     def leds(self) -> tuple[NDArray[np.str_], NDArray[np.str_]]:
-        """The run lamp and the error lamp of each axis' node, by name, each of shape (num_axes,).
+        """Patterns of the run LED and the error LED of each axis' node, by name, each of shape (num_axes,).
 
         "off", "on", "blinking", "single flash" or "double flash" (CiA 303-3; their times are in canopen/leds.py).
-        Drives on no bus show what they do after power-on: pre-operational, without an error.
+        Drives without a bus show the patterns after power-on: pre-operational, without an error.
         """
         shown = np.array([AFTER_POWER_ON] * self.inside.num_axes).T
         for axes, lamps in self._lamps:
@@ -415,7 +415,7 @@ class Machines:
         return run, error
 
     def connect_lamps(self, axes: slice, lamps: Callable[[], tuple[str, str]]) -> None:
-        """Set the lamps of axes to those of a node: run and error, by name."""
+        """Take the LEDs of axes from those of a node: patterns of run and error, by name."""
         self._lamps.append((axes, lamps))
 
     @property
@@ -424,7 +424,7 @@ class Machines:
         return self._axis_field("T_winding"), self._axis_field("T_stage")
 
     def set_temperatures(self, winding: ArrayLike, stage: ArrayLike) -> None:
-        """Set winding and stage temperature [degC], as if the axis had worked before."""
+        """Set winding and stage temperature [degC], as after previous work."""
         for name, value in (("T_winding", winding), ("T_stage", stage)):
             values = np.broadcast_to(np.asarray(value, float), (self.inside.num_axes,))
             set_lanes(self.inside.records, name, values)
@@ -433,7 +433,7 @@ class Machines:
         """Set a true parameter [SI] of the machines where the mask is true; bad input changes nothing.
 
         Raises:
-            ValueError: If there is no such parameter, the value is not finite, or no machine can have it.
+            ValueError: If there is no such parameter, the value is not finite, or impossible for a machine.
         """
         inside = self.inside
         check_known(name, inside.parameters)
@@ -447,8 +447,8 @@ class Machines:
     def set_all(self, values: Mapping[str, ArrayLike], where: Mask | None = None) -> None:
         """Set several true parameters [SI] at once; bad input changes nothing.
 
-        Only the machine that results must be one that can be, not those on the way to it; and a machine's inertias
-        are derived once, which is what `set` spends its time with.
+        Only the resulting machine must be possible, not intermediate ones; and a machine's inertias, which take most of
+        the time of `set`, are derived only once.
 
         Args:
             values: Parameter -> one value, or one per machine.
@@ -483,39 +483,39 @@ class Machines:
         axis: int | None = None,
         **parameters: float,
     ) -> int:
-        """Let something fail on machines, by a schedule; what each fault does is in docs/faults.md.
+        """Inject a fault into machines, by a schedule; docs/faults.md explains each fault.
 
-        A fault's change is on top of the machine as it was built, which `parameters` goes on to tell. It begins and
-        ends at communication cycles, and is the same for the same machine and seed.
+        A fault changes the machine without changing `parameters`. It begins and ends at communication cycles, and is
+        the same for the same machine and seed.
 
         Args:
-            name: A row of the table, as "encoder_stuck".
+            name: A row of the table, e.g. "encoder_stuck".
             at: Time from now, or from when the condition holds for the first time [s], whole communication cycles.
-            when: What it waits for: "" nothing, "enabled" an axis in operation enabled, or a comparison of the true
-                rotor angle [rad] or its speed [rad/s], as "position > 3.1" or "speed > 100".
-            duration: Whole communication cycles [s]; None lasts until it is cleared or the machine is reset.
+            when: Its condition: "" none, "enabled" an axis in operation enabled, or a comparison of the true rotor
+                angle [rad] or speed [rad/s], e.g. "position > 3.1" or "speed > 100".
+            duration: Whole communication cycles [s]; None: until it is cleared or the machine is reset.
             where: Machines.
-            axis: Number of the axis of each machine; all of them by default. Of a load's fault that is not of one axis
-                it has no meaning.
+            axis: Number of the axis of each machine; all of them by default. It has no effect on a load's fault that
+                does not concern one axis.
             **parameters: Numbers of the fault, in the units of its row.
 
         Returns:
             Its number, for `clear_fault`.
 
         Raises:
-            ValueError: For an unknown fault or parameter, an invalid time or condition, or a fault that this load
-                cannot have.
+            ValueError: For an unknown fault or parameter, an invalid time or condition, or a fault that is impossible
+                for this load.
         """
         order = Order(name, at, when, duration, axis=axis, parameters=parameters)
         return self._faults.add(order, self._mask(where))
 
     def faults(self) -> list[InjectedFault]:
-        """Return the faults that are still to come or are there; one that has ended everywhere is forgotten."""
+        """Return the faults that are scheduled or active; one that has ended on all machines is forgotten."""
         return self._faults.listing()
 
     @property
     def possible_faults(self) -> list[str]:
-        """Names of the faults that these machines can have, in the order of the table."""
+        """Names of the faults that are possible for these machines, in the order of the table."""
         found = []
         for name in FAULTS:
             try:
@@ -526,23 +526,23 @@ class Machines:
         return found
 
     def clear_fault(self, number: int | None = None, where: Mask | None = None) -> None:
-        """End a fault or call it off, None all of them; ValueError if there is none of that number."""
+        """End or cancel a fault; None: all of them. ValueError for an unknown number."""
         self._faults.clear(number, self._mask(where))
 
     def seed_noise(self, seeds: ArrayLike, where: Mask | None = None) -> None:
-        """Give machines another noise from their next reset on: whole numbers 1...2^32 - 1, shape (num_machines,)."""
+        """Set noise seeds of machines, from their next reset on: whole numbers 1...2^32 - 1, shape (num_machines,)."""
         mask = self._mask(where)
         chosen = np.asarray(seeds, float)
         if chosen.shape != mask.shape or np.any((chosen < 1.0) | (chosen >= 2.0**32)):
             raise ValueError(f"noise takes {len(mask)} seeds of 1...{2**32 - 1}, one per machine")
         axes = self.inside.num_axes // self.inside.num_machines
-        # As when machines are drawn: every axis has a noise of its own.
+        # As when machines are drawn: every axis has its own noise.
         apart = np.repeat(chosen, axes) + np.tile(np.arange(axes), len(mask))
         every = np.repeat(mask, axes)
         self.inside.noise_seeds[every] = (np.mod(apart, 2.0**32 - 1.0) + 1.0)[every]
 
     def reset(self, where: Mask | None = None) -> None:
-        """Put machines to rest at zero and switch their drives on anew; a diverged machine lives again, faults end."""
+        """Put machines to rest at zero and restart their drives; diverged machines recover, faults end."""
         mask = self._mask(where)
         inside = self.inside
         if self._faults.some:

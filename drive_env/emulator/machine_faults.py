@@ -1,4 +1,4 @@
-"""Faults of emulated machines: begun and ended by their schedule, on top of the machines as they were built."""
+"""Faults of emulated machines: begun and ended by their schedule, in addition to the machines' parameters."""
 
 from __future__ import annotations
 
@@ -33,19 +33,19 @@ if TYPE_CHECKING:
     from drive_env.emulator.inside import Inside
 
 
-_CHANGING = ("axes", "state", "begins", "ends")  # of a fault, beside what its order says
-ABSENT, WAITING, DUE, ON, OVER = range(5)  # a machine: not concerned, waits for the condition, for the time, ...
+_CHANGING = ("axes", "state", "begins", "ends")  # of a fault, in addition to its order
+ABSENT, WAITING, DUE, ON, OVER = range(5)  # in a machine: not concerned, waits for the condition, for the time, ...
 TWO_PI = 2.0 * math.pi
-SEED_STEP = 2_654_435_761  # golden ratio of 2^32: neighbouring seeds give noises apart
+SEED_STEP = 2_654_435_761  # golden ratio of 2^32: neighbouring seeds give different noise
 
 
 class InjectedFault(NamedTuple):
-    """A fault that is still to come or is there.
+    """A fault that is scheduled or active.
 
-    number: What `machine.fault` returned.
-    order: What was asked for.
+    number: Result of `machine.fault`.
+    order: The arguments of `machine.fault`.
     parameters: All numbers of the fault.
-    waiting, active: Which machines wait for it and have it, shape (num_machines,).
+    waiting, active: Machines in which it waits or acts, shape (num_machines,).
     """
 
     number: int
@@ -59,7 +59,7 @@ class InjectedFault(NamedTuple):
 class _MachineFault:
     """A fault with its state in each machine.
 
-    `delay` and `length` are its times in cycles; `axes` those that it is of, (num_axes,). Of each machine, shape
+    `delay` and `length` are its times in cycles; `axes` the axes concerned, (num_axes,). For each machine, shape
     (num_machines,): `state`, and the cycles at which it begins and ends.
     """
 
@@ -77,7 +77,7 @@ class _MachineFault:
     ends: Integers
 
     def changes_some(self, quantity: Quantity) -> bool:
-        """Return whether it is there on some machine, and changes a quantity."""
+        """Return whether it is active on any machine, and changes a quantity."""
         return bool(np.any(self.state == ON)) and any(change.quantity == quantity for change in self.changes)
 
     def is_over(self) -> bool:
@@ -100,8 +100,8 @@ def axes_that_fulfil(condition: Condition, inside: Inside) -> Mask:
 class MachineFaults:
     """All faults of a set of emulated machines. Without faults nothing is checked.
 
-    A fault's change is on top of the machine as it was built: `base` keeps what a quantity is without any, and several
-    faults of one quantity act in the order in which they were given.
+    Faults change quantities temporarily: `base` keeps a quantity's value without faults, and several faults of one
+    quantity act in the order in which they were added.
     """
 
     def __init__(self, inside: Inside) -> None:
@@ -118,9 +118,9 @@ class MachineFaults:
         """Schedule a fault and return its number; `Machines.fault` explains an order.
 
         Args:
-            order: What is asked for.
-            machines: Machines that have the fault, shape (num_machines,).
-            of_node: Axes that have it, of those the order is of, shape (num_axes,); all of them by default.
+            order: The fault.
+            machines: Machines that get it, shape (num_machines,).
+            of_node: Axes of the order that get it, shape (num_axes,); all of them by default.
         """
         inside, axis = self._inside, order.axis
         row, changes = self.check(order)
@@ -150,7 +150,7 @@ class MachineFaults:
         """Return the row of a fault and its changes.
 
         Raises:
-            ValueError: For a fault that these machines cannot have, or an invalid order.
+            ValueError: For a fault that is impossible for these machines, or an invalid order.
         """
         name, axis = order.name, order.axis
         row = find_fault(name)
@@ -164,7 +164,7 @@ class MachineFaults:
         return row, () if name in MOMENTS else self._changes(name)
 
     def listing(self) -> list[InjectedFault]:
-        """Return the faults that are still to come or are there."""
+        """Return the faults that are scheduled or active."""
         return [
             InjectedFault(
                 fault.number, fault.order, dict(fault.given), (fault.state == WAITING) | (fault.state == DUE),
@@ -186,7 +186,7 @@ class MachineFaults:
 
     @property
     def some(self) -> bool:
-        """Whether there is any fault to look after."""
+        """Whether any fault is scheduled or active."""
         return bool(self._faults)
 
     # --- states ---------------------------------------------------------------------------------------------------
@@ -204,7 +204,7 @@ class MachineFaults:
         }
 
     def restore_state(self, state: Mapping[str, Any]) -> None:
-        """Take the faults of a state over, with machines and records that are those of the state already."""
+        """Restore the faults of a state; machines and records must already be those of the state."""
         self._next_number, self._jam = state["next"], state["jam"].copy()
         self._base = {quantity: values.copy() for quantity, values in state["base"].items()}
         self._held = {quantity: mask.copy() for quantity, mask in state["held"].items()}
@@ -212,7 +212,7 @@ class MachineFaults:
 
     # --- time -----------------------------------------------------------------------------------------------------
     def act(self, now: int) -> int:
-        """Begin and end the faults due at cycle `now`; return the cycle by which to call again."""
+        """Begin and end the faults due at cycle `now`; return the cycle of the next call."""
         following = NEVER
         for fault in list(self._faults):
             waiting = fault.state == WAITING
@@ -235,7 +235,7 @@ class MachineFaults:
         return max(following, now + 1)
 
     def change_cycle(self, longer: float) -> None:
-        """Keep the times of all faults, in cycles that are so many times longer than before."""
+        """Keep the times of all faults when cycles become longer by a factor."""
         now = self._inside.cycle
         for fault in self._faults:
             fault.delay, fault.length = cycles_of(fault.order, fault.row, self._inside.cycles)
@@ -245,7 +245,7 @@ class MachineFaults:
 
     @contextmanager
     def suspended(self) -> Iterator[None]:
-        """Take all changes back while the machines as they were built are changed; then they are on top again."""
+        """Remove all changes while the machines' parameters are changed, and apply them again afterwards."""
         active = [(fault, fault.state == ON) for fault in self._faults if np.any(fault.state == ON)]
         for fault, machines in active:
             fault.state[machines] = OVER
@@ -261,7 +261,7 @@ class MachineFaults:
 
     # --- inside ---------------------------------------------------------------------------------------------------
     def _made(self, number: int, order: Order, axes: Mask, *changing: Integers) -> _MachineFault:
-        """Return a fault as its order has it, with its axes, and its state, begin and end in each machine."""
+        """Return a fault by its order, with its axes, and its state, begin and end in each machine."""
         row, changes = self.check(order)
         delay, length = cycles_of(order, row, self._inside.cycles)
         given, condition = checked_parameters(row, order.parameters), Condition.parse(order.when)
@@ -279,7 +279,7 @@ class MachineFaults:
         return of_drives(name, changes, device.firmware.layout.dtype.names or (), device.name)
 
     def _rehearse(self, changes: tuple[Change, ...], given: Mapping[str, float], axes: Mask) -> None:
-        """Refuse a change of the load that cannot be stepped now rather than in the middle of a run."""
+        """Refuse now, not in the middle of a run, a change of the load that cannot be stepped."""
         for change in changes:
             if change.quantity.kind == "load":
                 sound = self._get(change.quantity)
@@ -319,7 +319,7 @@ class MachineFaults:
         return self._machines(axes_that_fulfil(fault.condition, self._inside) & fault.axes)
 
     def _machines(self, axes: Mask) -> Mask:
-        """Return the machines of which an axis is meant."""
+        """Return the machines with at least one of the axes."""
         found: Mask = np.logical_or.reduce(axes.reshape(-1, self._axes_per_machine), axis=1)
         return found
 
@@ -327,7 +327,7 @@ class MachineFaults:
         """Set the quantities that a fault changes to their values under all active faults."""
         for quantity in {change.quantity for change in fault.changes}:
             while not self._refresh_quantity(quantity):
-                # Several faults together have made a load that cannot be stepped, the latest of them too much.
+                # Several faults together have made a load that cannot be stepped; the latest is removed.
                 latest = [one for one in self._faults if one.changes_some(quantity)][-1]
                 latest.state[latest.state == ON] = OVER
                 warnings.warn(
@@ -338,7 +338,7 @@ class MachineFaults:
                 )
 
     def _refresh_quantity(self, quantity: Quantity) -> bool:
-        """Bring one quantity to what its faults make of it; return whether the machines can have it."""
+        """Apply a quantity's faults; return whether the result is possible for the machines."""
         axes = self._inside.num_axes
         held = self._held.setdefault(quantity, np.zeros(axes, bool))
         present = self._get(quantity)
@@ -395,7 +395,7 @@ class MachineFaults:
             set_lanes(inside.records, quantity.name, values, axes, quantity.part)
 
     def _jump(self, angle: float, axes: Mask) -> None:
-        """Put the counters off by an angle [rad], as if so many edges came within one sample."""
+        """Shift the encoder counts by an angle [rad], as if that many edges came within one sample."""
         records, count = self._inside.records, self._inside.num_axes
         forwards = 1.0 - 2.0 * get_lanes(records, "encoder_true_direction", count).astype(float)
         counts = np.rint(angle * forwards * get_lanes(records, "encoder_counts", count).astype(float) / TWO_PI)

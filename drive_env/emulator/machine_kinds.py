@@ -1,4 +1,4 @@
-"""Which kind of machine the drives of each firmware turn."""
+"""Kind of machine for each firmware."""
 
 from __future__ import annotations
 

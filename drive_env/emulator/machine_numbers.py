@@ -1,10 +1,10 @@
-"""Random numbers of thousands of machines at once: those that NumPy's generator of each would give.
+"""Random numbers for thousands of machines at once, equal to those of NumPy's generator for each machine.
 
 Machine k of a seed has a generator of its own, `numpy.random.default_rng((seed, k))`, so that it is the same machine in
-every set. To make one takes some 30 us; the same arithmetic on arrays, one element for each machine, takes 2, and 3 ms
-whatever their number.
-`SeedSequence` (M. E. O'Neill, "Developing a seed_seq alternative", 2015) and PCG64 (XSL RR 128/64, "PCG: a family of
-simple fast space-efficient statistically good algorithms for random number generation", 2014) are as NumPy has them.
+every set. Creating one takes some 30 us; the same arithmetic on arrays, one element per machine, takes 2 us each, plus
+3 ms in all. `SeedSequence` (M. E. O'Neill, "Developing a seed_seq alternative", 2015) and PCG64 (XSL RR 128/64, "PCG: a
+family of simple fast space-efficient statistically good algorithms for random number generation", 2014) are as NumPy
+has them.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ _Halves = NDArray[np.uint32]
 _Words = NDArray[np.uint64]
 _Wide = tuple[_Words, _Words]  # 128 bits: upper and lower half
 
-_FEW = 100  # machines that NumPy's generators serve faster
-_POOL = 4  # halves of a word that SeedSequence stirs
+_FEW = 100  # up to this number NumPy's generators are faster
+_POOL = 4  # words in the pool of SeedSequence
 _FIRST_IN, _FACTOR_IN = 0x43B0D7E5, 0x931E8875
 _FIRST_OUT, _FACTOR_OUT = 0x8B51F9DD, 0x58F38DED
 _MIX_LEFT, _MIX_RIGHT = np.uint32(0xCA01F9DD), np.uint32(0x4973F715)
@@ -32,12 +32,12 @@ _HALF, _LOW_HALF = np.uint64(32), np.uint64(2**32 - 1)
 def machine_numbers(seed: int, machines: Sequence[int], count: int) -> tuple[Floats, Floats]:
     """Return an integer of 1...2^32 - 1 for each machine, shape (n,), and `count` shares of 0...1, shape (n, count).
 
-    Of machine k they are `integers(1, 2**32)` and then `random(count)` of `numpy.random.default_rng((seed, k))`.
+    For machine k they are `integers(1, 2**32)` and then `random(count)` of `numpy.random.default_rng((seed, k))`.
 
     Args:
-        seed: Of the set, 0 or more.
+        seed: The set's seed, 0 or more.
         machines: Their numbers, 0 or more.
-        count: How many shares each gets.
+        count: Number of shares for each.
 
     Raises:
         ValueError: For a negative seed or number.
@@ -47,14 +47,14 @@ def machine_numbers(seed: int, machines: Sequence[int], count: int) -> tuple[Flo
         integers, shares = machine_numbers(seed, distinct.tolist(), count)
         return integers[place], shares[place]
     integers, shares = np.empty(len(machines)), np.empty((len(machines), count))
-    # Of two words a number is for a set of its own; `default_rng` also refuses what is negative.
+    # Numbers of two words are left to `default_rng`, and so are negative ones, which it refuses.
     short = np.array([len(machines) >= _FEW and seed >= 0 and 0 <= number < 2**32 for number in machines], bool)
     if np.any(short):
         words = [np.full(int(short.sum()), word, np.uint32) for word in _halves(seed)]
         numbers = np.array([number for number, plain in zip(machines, short, strict=True) if plain], np.uint32)
         stream = _pcg64(*_seeds([*words, numbers]))
         first = next(stream) & _LOW_HALF
-        # Lemire's way from 32 bits to 1...2^32 - 1; it rejects 0 alone.
+        # Lemire's method from 32 bits to 1...2^32 - 1, which rejects only 0.
         integers[short] = 1 + (first * np.uint64(2**32 - 1) >> _HALF)
         for k in range(count):
             shares[short, k] = (next(stream) >> np.uint64(11)) * 2.0**-53
@@ -108,7 +108,7 @@ def _pcg64(seed: _Wide, increment: _Wide) -> Iterator[_Words]:
     """Yield the generators' 64-bit numbers one after the other, each of shape (n,)."""
     one = np.uint64(1)
     odd = increment[0] << one | increment[1] >> np.uint64(63), increment[1] << one | one
-    # A step from 0 leaves the increment.
+    # A step from 0 gives the increment.
     state = _step(_sum(odd, seed), odd)
     while True:
         state = _step(state, odd)

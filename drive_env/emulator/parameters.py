@@ -1,4 +1,4 @@
-"""True parameters of emulated machines: the table of them, drawing a machine, and bringing values into the records."""
+"""True parameters of emulated machines: their table, drawing of machines, and writing values into the records."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from mechanics.reading.near_names import did_you_mean
 Records = NDArray[np.void]
 Write = Callable[[Records, Device, Motor, Floats, Mask], None]
 
-# How a motor's cable is wired, each 0 or 1: what 2080h:01, 2070h:01 and 2070h:02 must say for the motor to turn.
+# Wiring of a motor's cable, each 0 or 1: the values that 2080h:01, 2070h:01 and 2070h:02 need for the motor to turn.
 WIRING = ("motor.encoder_direction", "motor.hall_polarity", "motor.hall_direction")
 
 
 class MachineParameter(NamedTuple):
-    """A number of the machine that may be set: default, range of randomisation, value of an ideal machine, unit."""
+    """A parameter of the machine: default, range of randomisation, value of an ideal machine, unit."""
 
     name: str
     unit: str
@@ -37,15 +37,15 @@ class MachineParameter(NamedTuple):
 
 
 class MachineKind(NamedTuple):
-    """The parts that the machines of a firmware have beside those of all; a row of `machine_kinds.py`.
+    """Properties of the machines of a firmware in addition to those of all machines; a row of `machine_kinds.py`.
 
     Attributes:
         motor_parameters: (motor) -> parameters of the motor, in the order in which they are drawn.
-        wiring_parameters: (motor) -> those of its cables, drawn after all others.
-        set_constants: (records, device, motor): writes the fields that no parameter is.
-        writes: Name of a parameter -> what brings its values, one per axis, into the records of some axes.
-        noise: Field that is the state of the axes' noise generator; "" without one.
-        connect: (records, device, axes): connects what the axes of one drive have in common; None: nothing.
+        wiring_parameters: (motor) -> parameters of its cables, drawn after all others.
+        set_constants: (records, device, motor): writes the fields that are not parameters.
+        writes: Name of a parameter -> function that writes its values, one per axis, into the records of some axes.
+        noise: Field with the state of the axes' noise generator; "" without one.
+        connect: (records, device, axes): connects what the axes of one drive share; None: nothing.
     """
 
     motor_parameters: Callable[[Motor], list[MachineParameter]]
@@ -59,7 +59,7 @@ class MachineKind(NamedTuple):
 def parameter_table(
     kind: MachineKind, device: Device, motor: Motor, load: Load, load_defaults: Mapping[str, float]
 ) -> dict[str, MachineParameter]:
-    """Return every parameter of a machine by name: `motor.`, `stage.` and `load.` with a dot.
+    """Return every parameter of a machine by name, with the prefix `motor.`, `stage.` or `load.`.
 
     Raises:
         ValueError: If the device names a parameter of its stage that its firmware does not know.
@@ -80,7 +80,7 @@ def parameter_table(
                 f"load.{parameter.name}", parameter.unit, value, parameter.low * value, parameter.high * value, value
             )
         )
-    # Last, so that all others are drawn as they were without them.
+    # Last, so that all others are drawn as without them.
     rows += kind.wiring_parameters(motor)
     return {row.name: row for row in rows}
 
@@ -96,16 +96,16 @@ def draw_parameters(
 ) -> tuple[dict[str, Floats], Floats]:
     """Return each machine's parameters, and the seed of its noise, shape (machines,).
 
-    A machine is known by its number: machine 5 of a set is the same machine in every set with that seed, and which
-    parameters are drawn changes nothing about the others.
+    Machine 5 of a seed is the same machine in every set, and the choice of drawn parameters does not change the others.
 
     Args:
-        table: The parameters there are.
+        table: All parameters.
         seed: Seed of the set.
         machines: Numbers of the machines.
         randomise: True draws all, False none; or names, a group's ("load") or a parameter's ("load.inertia").
-        ideal: Use ideal values in place of defaults.
-        wired_as_known: Draw no wiring unless it is named itself: for drives that were commissioned for the motor's.
+        ideal: Whether to use ideal values instead of defaults.
+        wired_as_known: Whether to draw wiring only if it is named itself: for drives commissioned for the motor's
+            wiring.
 
     Raises:
         ValueError: For an unknown group or parameter.
@@ -126,10 +126,10 @@ def draw_parameters(
     return values, noise
 
 
-# Parameters that may be negative: errors, offsets and phases. Those that may be 0: losses and faults. All others are
-# positive.
+# Parameters that may be negative: errors, offsets and phases. Those that may be 0: losses and faults. All others must
+# be positive.
 _SIGNED = ("offset", "error", "phase", "ambient", "index_angle")
-_VANISHING_GROUPS = ("load.", "bus.", "fault.")  # whose values may be 0, whatever they are
+_VANISHING_GROUPS = ("load.", "bus.", "fault.")  # all of their values may be 0
 _MAY_VANISH = (
     "cogging_torque", "detent_torque", "saturation", "coulomb", "viscous", "broken", "open_a", "open_b",
     "short_conductance", "short_a", "short_b", "index_inverted", "brake_opens_in", "brake_closes_in", "noise",
@@ -150,7 +150,7 @@ def check_one_supply(volts: Floats, links: Integers) -> None:
 
 
 def check_parameter(name: str, values: Floats) -> None:
-    """Raise ValueError unless every value is one that a machine can have."""
+    """Raise ValueError unless every value is possible for a machine."""
     if not np.all(np.isfinite(values)):
         raise ValueError(f"{name} must be finite, not {values[~np.isfinite(values)][0]}")
     if any(word in name for word in _SIGNED) or values.size == 0:
@@ -162,7 +162,7 @@ def check_parameter(name: str, values: Floats) -> None:
         return
     if name == "stage.adc_bits" and values.min() < 1.0:
         raise ValueError(f"{name} must be 1 or more, not {values.min():g}")
-    # Of a load, its field decides whether it may vanish: mechanics/load_values.py refuses a body without mass.
+    # For a load its field decides whether it may be 0: mechanics/load_values.py refuses a body without mass.
     if name.startswith(_VANISHING_GROUPS) or any(name.endswith(word) for word in _MAY_VANISH):
         if values.min() < 0.0:
             raise ValueError(f"{name} must be 0 or more, not {values.min():g}")
@@ -171,7 +171,7 @@ def check_parameter(name: str, values: Floats) -> None:
 
 
 def check_known(name: str, known: Collection[str]) -> None:
-    """Raise ValueError, with those that there are, unless machines have a parameter of that name."""
+    """Raise ValueError, listing the known ones, unless machines have a parameter of that name."""
     if name not in known:
         raise ValueError(
             f"machines have no parameter {name!r}; they have {', '.join(known)}{did_you_mean(name, known)}"
@@ -210,8 +210,8 @@ def field(name: str, part: int = 0, live: str = "") -> Write:
 
     Args:
         name: The field.
-        part: Of a deep one.
-        live: Field that the thermal model sets once a period; until then it is the value at 25 degC. "" for none.
+        part: Element of a deep field.
+        live: Field that the thermal model updates once a period, initially the value at 25 degC; "" for none.
     """
 
     def write(records: Records, device: Device, motor: Motor, values: Floats, axes: Mask) -> None:
@@ -223,7 +223,7 @@ def field(name: str, part: int = 0, live: str = "") -> Write:
 
 
 def change_encoder(records: Records, field: str, values: Floats, axes: Mask) -> None:
-    """Change how encoders count from here on, by a field of the record: their counts so far stay."""
+    """Change how encoders count from now on, by a field of the record; their present counts stay."""
 
     def lanes(name: str) -> Floats:
         return get_lanes(records, name, len(values)).astype(float)
@@ -242,13 +242,13 @@ def change_encoder(records: Records, field: str, values: Floats, axes: Mask) -> 
 
 
 def set_encoder_counts(records: Records, motor: Motor, interpolation: Floats, axes: Mask) -> None:
-    """Give encoders the motor's counts a turn, each interpolated by a factor."""
+    """Set the counts per turn of encoders to the motor's, each interpolated by a factor."""
     set_lanes(records, "encoder_interpolation", interpolation, axes)
     set_lanes(records, "encoder_counts", motor.encoder_counts * interpolation, axes)
 
 
 def set_velocity_filter(records: Records, device: Device, cutoff: Floats, axes: Mask) -> None:
-    """Give the filter of the measured velocity a corner frequency [Hz]; ValueError for one that the rate forbids."""
+    """Set the corner frequency [Hz] of the velocity filter; ValueError for one that the rate does not allow."""
     limit = 0.45 * device.velocity_rate
     if np.any(cutoff[axes] > limit) or np.any(cutoff[axes] <= 0.0):
         worst = cutoff[axes][np.argmax(np.abs(cutoff[axes] - 0.5 * limit))]
@@ -259,7 +259,7 @@ def set_velocity_filter(records: Records, device: Device, cutoff: Floats, axes: 
     set_lanes(records, "velocity_filter_a", a2, axes, 1)
 
 
-# Of the machines of every firmware.
+# Parameters of the machines of every firmware.
 COMMON: dict[str, Write] = {
     "motor.R_s": field("R_nominal", live="R_s"),
     "motor.psi_m": field("psi_nominal", live="psi_m"),

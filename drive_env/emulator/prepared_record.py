@@ -1,7 +1,7 @@
-"""A call of `record` that repeats, prepared: objects to play and to sample, with factors and limits, for compiled code.
+"""Prepared form of a repeated call of `record` for compiled code: its objects with factors and limits.
 
-An outer controller makes the same call a thousand times a second; looking names up and converting object by object
-takes longer then than the drives' own millisecond.
+An outer controller makes the same call a thousand times a second; looking up names and converting object by object
+would take longer than emulating the millisecond.
 """
 
 from __future__ import annotations
@@ -20,18 +20,18 @@ from mechanics.kernels.compiled import cached, stage
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-# Fields that factors depend on: played, they would change between two rows.
-SCALE_FIELD = "position_scaler"  # increments of a revolution
-RATIO_FIELD = "velocity_ratio"  # rpm of a velocity unit; of drives that have such
-SET_POINT_FIELD = "set_point_ratio"  # velocity units of a target velocity of vl; of drives that have such
-PEAK_FIELD = "peak_current"  # of the motor [A]; of drives that tell torques in its parts
-NOMINAL_FIELD = "nominal_motor_current"  # [A]; likewise, in its thousandths
-PROFILE_FIELD = "profile_bits"  # of drives whose profile generator counts in increments of its own
+# Fields that factors depend on: if played, they would change between two rows.
+SCALE_FIELD = "position_scaler"  # increments per revolution
+RATIO_FIELD = "velocity_ratio"  # rpm of a velocity unit, if the drive has one
+SET_POINT_FIELD = "set_point_ratio"  # velocity units of a target velocity of vl, if the drive has them
+PEAK_FIELD = "peak_current"  # of the motor [A], if torques are relative to it
+NOMINAL_FIELD = "nominal_motor_current"  # [A]; likewise, for thousandths
+PROFILE_FIELD = "profile_bits"  # for drives whose profile generator has its own increments
 SCALES = frozenset({SCALE_FIELD, RATIO_FIELD, SET_POINT_FIELD, PEAK_FIELD, NOMINAL_FIELD, PROFILE_FIELD})
 
 
 class PreparedObject(NamedTuple):
-    """An object that is played or sampled: its factor of each axis [SI per drive unit], shape (num_axes,)."""
+    """A played or sampled object with its factor for each axis [SI per drive unit], shape (num_axes,)."""
 
     key: tuple[int, int]
     code: Code
@@ -42,9 +42,9 @@ class PreparedRecord:
     """The objects that one call plays and samples.
 
     Args:
-        played: Fields that rows go to, and their rows.
-        sampled: Fields that are sampled, and their rows.
-        scale_changes: Of the dictionary, when the factors were taken; they hold until it changes.
+        played: Played fields, and their conversions.
+        sampled: Sampled fields, and their conversions.
+        scale_changes: The dictionary's count when the factors were read; they are valid until it changes.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class PreparedRecord:
         self.input_codes = compiled_rows([row.code for row in self.inputs], decoded=True)
 
     def play(self, play: Mapping[ObjectName, ArrayLike], values: Floats) -> bool:
-        """Fill in the SI values, shape (cycles, objects, num_axes); False for rows that the long way must refuse."""
+        """Fill in the SI values, shape (cycles, objects, num_axes); False for rows that the normal call must refuse."""
         cycles, _, num_axes = values.shape
         for k, (row, given) in enumerate(zip(self.inputs, play.values(), strict=True)):
             raw = np.asarray(given)
@@ -79,7 +79,7 @@ class PreparedRecord:
         return True
 
     def read(self, samples: Floats) -> dict[tuple[int, int], Integers]:
-        """Return the integers on the wire of SI samples, shape (rows, objects, num_axes)."""
+        """Return the integers on the bus of SI samples, shape (rows, objects, num_axes)."""
         raw = np.empty((samples.shape[1], samples.shape[0], samples.shape[2]), np.int64)
         to_od(samples, self.factors, self.codes, raw)
         return dict(zip(self.keys, raw, strict=True))

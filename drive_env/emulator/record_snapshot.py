@@ -1,4 +1,4 @@
-"""Values of many fields of drive records, to be put into some axes at once, as a reset or a restart does."""
+"""Values of many fields of drive records, written to some axes at once, as by a reset or a restart."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from drive_env.firmware import cycle
 from drive_env.firmware.record import LANES, RecordLayout
 from mechanics.arrays import Floats, Mask
 
-_AT_ONCE = 4096  # axes whose places in memory are computed together: those of 65,536 would take 100 MB
+_AT_ONCE = 4096  # axes whose memory addresses are computed together: those of 65,536 would take 100 MB
 
 
 class RecordSnapshot:
-    """Fields and the values that they get.
+    """Fields with their values.
 
     Args:
-        layout: Of the records.
-        records: Whose fields they are, contiguous.
+        layout: The records' layout.
+        records: The records, contiguous.
         fields: Pairs of field and part.
-        values: One row per field, of one value for all axes or one per axis.
+        values: One row per field, with one value for all axes or one per axis.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Machines with servo drives: true parameters of motor and power stage, and the fields of the record that they are."""
+"""Machines with servo drives: true parameters of motor and power stage, and their fields of the record."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def motor_parameters(motor: Motor) -> list[MachineParameter]:
         ("thermal_time", "s", motor.thermal_time),
         ("ambient", "degC", 25.0),
         ("hall_offset", "rad", 0.0),
-        # Broken cables: 1 is broken. Never drawn: a world with faults is made on purpose.
+        # Broken cables: 1 is broken. Never drawn: faults are only made on purpose.
         ("hall_broken", "1", 0.0),
         ("encoder_broken", "1", 0.0),
         ("open_a", "1", 0.0),
@@ -51,7 +51,7 @@ def motor_parameters(motor: Motor) -> list[MachineParameter]:
 
 
 def wiring_parameters(motor: Motor) -> list[MachineParameter]:
-    """Return how the motor's cables may be wired, and where its encoder's index is."""
+    """Return the wiring parameters of the motor's cables, and the position of its encoder's index."""
     wired = {name: float(getattr(motor, name.removeprefix("motor."))) for name in WIRING}
     rows = [MachineParameter(name, "1", value, 0.0, 1.0, value) for name, value in wired.items()]
     return [*rows, MachineParameter("motor.index_angle", "rad", 0.0, 0.0, 2.0 * np.pi, 0.0)]
@@ -63,7 +63,7 @@ def _set_adc(records: Records, device: Device, motor: Motor, bits: Floats, axes:
 
 
 def _set_commutation_offset(records: Records, device: Device, motor: Motor, values: Floats, axes: Mask) -> None:
-    """A drive that runs is aligned: the error of its angle changes with the offset."""
+    """Set the commutation offset; a running drive was aligned, so the error of its angle changes with it."""
     change = values - get_lanes(records, "commutation_offset", len(values)).astype(float)
     set_lanes(records, "angle_zero", get_lanes(records, "angle_zero", len(values)).astype(float) + change, axes)
     set_lanes(records, "commutation_offset", values, axes)

@@ -1,9 +1,8 @@
-"""Machines with servo amplifiers on mains: a servo machine's parameters, and those of rectifier, link and resistor.
+"""Machines with servo amplifiers on mains: parameters of a servo machine, rectifier, DC link and braking resistor.
 
-The axes of a machine with an even number of them are the pairs of two-axis modules, and share links. Machines of one
-axis have nothing in common with each other, each with a module of its own, until a node of a fieldbus has two of them:
-axes of one module share its link, whatever they turn. A machine of three axes has three links, and so has each axis
-of a device with one axis.
+In a machine with an even number of axes, pairs of axes form two-axis modules and share DC links. Machines of one axis
+have a module each, until a fieldbus node has two of them: axes of one module share its link, whatever they turn. A
+machine of three axes has three links, and each axis of a device with one axis has its own.
 """
 
 from __future__ import annotations
@@ -19,35 +18,35 @@ from drive_env.firmware.servo.alignment import BLDC, ENCODER, USE_OFFSET
 from drive_env.motors import Motor
 from mechanics.arrays import Mask
 
-AXES = 2  # that share a link
-OFFSET_SHARE = 0.05  # of the current's range, that may be measured while the stage is off
-CHOPPER, CHOPPER_HYSTERESIS = 0.92, 0.025  # of the over-voltage: where the chopper begins, and how far it draws down
+AXES = 2  # per shared DC link
+OFFSET_SHARE = 0.05  # of the current's range: largest current reading while the stage is off
+CHOPPER, CHOPPER_HYSTERESIS = 0.92, 0.025  # of the over-voltage: where the chopper starts, and its hysteresis
 MOTOR_TEMPERATURE, AMBIENT = 145.0, 60.0  # degC; class values: below the sensor's limit (M-MaxResTerm), and a cabinet
 
-_NOT_HERE = {"stage.idle_current", "stage.supply_sinks"}  # the rectifier feeds only
+_NOT_HERE = {"stage.idle_current", "stage.supply_sinks"}  # the rectifier only feeds
 
 
 def motor_parameters(motor: Motor) -> list[MachineParameter]:
-    """Return the parameters of a motor, in the order in which they are drawn; those of mains and brake never are."""
+    """Return the parameters of a motor, in the order of drawing; those of mains and brake are never drawn."""
     rows = servo_machine.motor_parameters(motor)
     for name in ("mains_phase_lost", "emergency_stop"):
         rows.append(MachineParameter(f"stage.{name}", "1", 0.0, 0.0, 0.0, 0.0))
-    for name, value in (("brake_opens_in", 0.04), ("brake_closes_in", 0.02)):  # usual for a brake that a spring closes
+    for name, value in (("brake_opens_in", 0.04), ("brake_closes_in", 0.02)):  # usual for a brake closed by a spring
         rows.append(MachineParameter(f"motor.{name}", "s", value, value, value, value))
     return rows
 
 
 def wiring_parameters(motor: Motor) -> list[MachineParameter]:
-    """Return how the motor's cables may be wired, and what its brake is connected to, which is never drawn."""
+    """Return the wiring parameters of the motor's cables, and the connection of its brake, which is never drawn."""
     brake = (("motor.brake_switch", "1", 0.0), ("stage.brake_supply", "V", 24.0))
     rows = [MachineParameter(name, unit, value, value, value, value) for name, unit, value in brake]
     return [*SERVO.wiring_parameters(motor), *rows]
 
 
 def set_constants(records: Records, device: Device, motor: Motor) -> None:
-    """Write the constants of stage and motor that are not parameters, and the drive's own data of its motor."""
+    """Write the constants of stage and motor that are not parameters, and the drive's data of its motor."""
     servo_machine.set_constants(records, device, motor)
-    records["cyclic_wraps"] = 1  # positions of 64 bits inside: the 32 bits outside are their end
+    records["cyclic_wraps"] = 1  # internal positions have 64 bits; 6064h has the lower 32
     records["chopper_enable"] = 1.0
     records["chopper_voltage"] = CHOPPER * device.overvoltage
     records["chopper_hysteresis"] = CHOPPER_HYSTERESIS * device.overvoltage
@@ -60,14 +59,14 @@ def set_constants(records: Records, device: Device, motor: Motor) -> None:
     for lane in range(LANES):  # three inputs for the switches of each axis of a module
         records["switch_input"][:, :, lane] = 3 * (lane % device.num_axes) + np.arange(3)
         records["module_axis"][:, lane] = lane % device.num_axes
-    # Of an absolute encoder, which knows the rotor's angle.
+    # for an absolute encoder, which knows the rotor's angle
     records["motor_type"], records["commutation_mode"], records["encoder_init_mode"] = BLDC, ENCODER, USE_OFFSET
     records["pole_pairs"], records["encoder_steps"] = motor.n_p, motor.encoder_counts
     records["encoder_direction"] = motor.encoder_direction
 
 
 def connect(records: Records, device: Device, axes: Mask) -> None:
-    """Let axes of a two-axis device share link and inputs with the other one of their pair: axes 2k and 2k + 1."""
+    """Make axes 2k and 2k + 1 of a two-axis device share DC link and inputs."""
     if device.num_axes != AXES:
         return
     pairs = np.zeros(len(axes) + len(axes) % 2, bool)

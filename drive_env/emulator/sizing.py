@@ -1,4 +1,4 @@
-"""Motor and gears for the joints of a model: the smallest motor of a list that moves them all, with what is left."""
+"""Motor and gears for the joints of a model: the smallest motor of a list that moves them all, with the margins."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from mechanics.joint_loads import JointLoad
 RATIOS = (1, 3, 4, 5, 7, 8, 10, 12, 15, 16, 20, 25, 30, 35, 40, 50, 60, 70, 80, 100, 120, 160)
 # Usual travel of a slide per turn of its ball screw or toothed-belt pulley [mm].
 LEADS = (200, 160, 120, 100, 80, 60, 50, 40, 32, 25, 20, 16, 10, 5, 4, 2.5, 2)
-MARGIN = 1.25  # least of torque and of speed: a quarter in reserve
-SPAN = {"hinge": 2.0 * math.pi, "slide": 1.0}  # rad and m: the longest move that is asked for
+MARGIN = 1.25  # least margin of torque and of speed: a quarter in reserve
+SPAN = {"hinge": 2.0 * math.pi, "slide": 1.0}  # rad and m: the longest move considered
 
 
 class Demand(NamedTuple):
@@ -28,14 +28,14 @@ class Demand(NamedTuple):
 
 
 class AxisProposal(NamedTuple):
-    """A gear between a motor and a joint, and what is left there.
+    """A gear between a motor and a joint, and its margins.
 
     Attributes:
         gear: Rotor angle per unit of the joint [1 or rad/m].
-        inertia: Of what is turned, at the rotor, the most over the poses [kg*m^2]; the rotor's own comes on top.
-        inertia_ratio: The same over the rotor's.
-        torque_margin: The motor's rated torque, or what the drive has current for, over the most that the move takes.
-        speed_margin: The motor's rated speed on the drive's supply over that of the move.
+        inertia: Largest load inertia at the rotor over all poses [kg*m^2], without the rotor's own.
+        inertia_ratio: That over the rotor's inertia.
+        torque_margin: The motor's rated torque, limited by the drive's current, over the largest torque of the move.
+        speed_margin: The motor's rated speed on the drive's supply over the speed of the move.
         encoder_margin: As `encoder_margin`.
     """
 
@@ -48,41 +48,41 @@ class AxisProposal(NamedTuple):
 
     @property
     def least_margin(self) -> float:
-        """The least of the three margins and of the largest inertia ratio over this one."""
+        """The least of the three margins and of the largest allowed inertia ratio over this one."""
         inertia = MARGIN * MAX_INERTIA_RATIO / self.inertia_ratio
         return min(self.torque_margin, self.speed_margin, self.encoder_margin, inertia)
 
 
 class DriveProposal(NamedTuple):
-    """A motor, the same for all joints of a machine, and the gear of each."""
+    """A motor, the same for all joints of a machine, and the gear of each joint."""
 
     motor: Motor
     axes: tuple[AxisProposal, ...]
 
     @property
     def fits(self) -> bool:
-        """Whether every axis has its margins, and no more inertia than can be tuned."""
+        """Whether every axis has its margins, and not more inertia than can be tuned."""
         return all(axis.least_margin >= MARGIN for axis in self.axes)
 
 
 def demand(joint: JointLoad, move_time: float) -> Demand:
-    """Return speed and acceleration of a move over the range of a joint, or the part of it in `SPAN`, in a time [s]."""
+    """Return speed and acceleration of a move over the range of a joint, at most `SPAN`, in a time [s]."""
     way = min(joint.travel.high - joint.travel.low, SPAN[joint.kind])
     return Demand(1.5 * way / move_time, 4.5 * way / move_time**2)
 
 
 def encoder_margin(device: Device, motor: Motor, inertia: float) -> float:
-    """Return the rated torque over what the velocity loop answers one count of the encoder with.
+    """Return the rated torque over the torque with which the velocity loop answers one encoder count.
 
-    A count of angle q comes out of the velocity filter, a second-order low-pass of corner w, as a speed of up to
-    q w exp(-d acos(d) / sqrt(1 - d^2)), and the loop answers it with J w_v times that, w_v as the baseline rule has it.
-    Below 1 gains are noisy, or too slow to overcome friction: `drive-tune auto` tuned a disc on three motors with 2,048
-    and 4,096 counts wherever this was 1.05 or more, and on one of them below, at 0.68.
+    A count of angle q comes out of the velocity filter, a second-order low-pass of corner w, as a speed of up to q w
+    exp(-d acos(d) / sqrt(1 - d^2)), and the loop answers it with J w_v times that, w_v by the baseline rule. Below 1
+    gains are noisy, or too slow to overcome friction: `drive-tune auto` tuned a disc on three motors with 2,048 and
+    4,096 counts wherever this was 1.05 or more, and on one of them below, at 0.68.
 
     Args:
         device: The drive.
         motor: The motor.
-        inertia: What its rotor turns, with its own [kg*m^2].
+        inertia: Total inertia at the rotor [kg*m^2].
     """
     corner, d = device.stage["velocity_filter"].default, VELOCITY_FILTER_DAMPING
     peak = 2.0 * math.pi * corner * math.exp(-d * math.acos(d) / math.sqrt(1.0 - d * d))
@@ -94,7 +94,7 @@ def encoder_margin(device: Device, motor: Motor, inertia: float) -> float:
 def axis_proposal(joint: JointLoad, device: Device, motor: Motor, gear: float, move_time: float) -> AxisProposal:
     """Return the margins of a gear between a motor and a joint in a move over the joint's range.
 
-    Torque at the rotor: ((J a + holding + dry friction + d w) / gear) + J_rotor gear a, each at its most.
+    Torque at the rotor: ((J a + holding + dry friction + d w) / gear) + J_rotor gear a, each at its maximum.
     """
     speed, acceleration = demand(joint, move_time)
     holding = max(abs(joint.holding.low), abs(joint.holding.high))
@@ -111,13 +111,13 @@ def axis_proposal(joint: JointLoad, device: Device, motor: Motor, gear: float, m
 def propose_drives(
     joints: Sequence[JointLoad], device: Device, motors: Iterable[Motor], move_time: float
 ) -> DriveProposal:
-    """Return the motor of least rated power whose margins suffice at every joint; without one, that which lacks least.
+    """Return the motor of least rated power with sufficient margins at every joint; otherwise the closest one.
 
     Args:
-        joints: Those that drives turn, one or more.
+        joints: The driven joints, one or more.
         device: The drives.
-        motors: To choose from, one or more.
-        move_time: In which each joint moves over its range [s].
+        motors: The candidates, one or more.
+        move_time: Time in which each joint moves over its range [s].
     """
     best: DriveProposal | None = None
     for motor in sorted(motors, key=lambda one: one.rated_torque * one.rated_speed):

@@ -1,4 +1,4 @@
-"""Machines with stepper drives: true parameters of motor and stage, and the fields of the record that they are."""
+"""Machines with stepper drives: true parameters of motor and stage, and their fields of the record."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def motor_parameters(motor: Motor) -> list[MachineParameter]:
         ("motor.thermal_time", "s", motor.thermal_time),
         ("motor.ambient", "degC", 25.0),
         ("motor.saturation", "1/A^2", motor.saturation),
-        # Broken cables: 1 is broken. Never drawn: a world with faults is made on purpose.
+        # Broken cables: 1 is broken. Never drawn: faults are only made on purpose.
         ("motor.encoder_broken", "1", 0.0),
         ("motor.open_a", "1", 0.0),
         ("motor.open_b", "1", 0.0),
@@ -45,7 +45,7 @@ def motor_parameters(motor: Motor) -> list[MachineParameter]:
 
 
 def wiring_parameters(motor: Motor) -> list[MachineParameter]:
-    """Return how the motor's cables may be wired, where its encoder's index is, and how quick a brake on it is."""
+    """Return the wiring parameters of the motor's cables, its encoder's index, and the times of a brake on it."""
     wired = float(motor.encoder_direction)
     return [
         MachineParameter("motor.encoder_direction", "1", wired, 0.0, 1.0, wired),
@@ -53,7 +53,7 @@ def wiring_parameters(motor: Motor) -> list[MachineParameter]:
         MachineParameter("stage.short_a", "S", 0.0, 0.0, 0.0, 0.0),
         MachineParameter("stage.short_b", "S", 0.0, 0.0, 0.0, 0.0),
         MachineParameter("motor.index_inverted", "1", 0.0, 0.0, 0.0, 0.0),
-        # Usual for brakes of some newton metres that a spring closes.
+        # Usual for brakes of some newton metres that are closed by a spring.
         MachineParameter("motor.brake_opens_in", "s", 0.04, 0.02, 0.08, 0.04),
         MachineParameter("motor.brake_closes_in", "s", 0.02, 0.01, 0.04, 0.02),
     ]

@@ -24,7 +24,7 @@ ENVIRONMENTS = {
     "ServoDrive/GainScheduling-v0": ("gain_scheduling", "GainScheduling"),
     "ServoDrive/Tracking-v0": ("tracking", "Tracking"),
 }
-# What a vector environment takes beside its configuration's options.
+# Further arguments of a vector environment, besides its configuration's options.
 _AROUND = ("config", "drives", "sensor", "reach", "autoreset_mode", "render_mode", "reward")
 
 
@@ -43,7 +43,7 @@ def register() -> None:
 
 
 def environment_of(name: str) -> str:
-    """Return the configurable environment that a name stands for: a task's own, or itself.
+    """Return the configurable environment of a name: that of a task, or the environment itself.
 
     Raises:
         ValueError: For an unknown name.
@@ -52,7 +52,7 @@ def environment_of(name: str) -> str:
         return TASKS[name].environment
     if name in ENVIRONMENTS:
         return name
-    from mechanics.reading.near_names import did_you_mean  # not before `commands` has looked whose `mechanics` that is
+    from mechanics.reading.near_names import did_you_mean  # after `commands` has checked `mechanics`
 
     known = (*ENVIRONMENTS, *TASKS)
     raise ValueError(f"there is no environment {name!r}{did_you_mean(name, known)}; there are {', '.join(known)}")
@@ -63,9 +63,9 @@ def make_vector(num_envs: int = 1, *, name: str, **options: Any) -> VectorEnviro
 
     Args:
         num_envs: Number of environments.
-        name: Of a configurable environment or of a task of the suite.
-        options: drives, sensor, reach, autoreset_mode, render_mode and reward as the environment takes them, and those
-            of its configuration; of a task num_threads alone.
+        name: Name of a configurable environment or of a task of the suite.
+        options: drives, sensor, reach, autoreset_mode, render_mode and reward as for the environment, and the fields of
+            its configuration; for a task only num_threads.
 
     Raises:
         ValueError: For an unknown name, or an option that the task or environment does not have.
@@ -79,7 +79,7 @@ def make_vector(num_envs: int = 1, *, name: str, **options: Any) -> VectorEnviro
 
 
 def make_single(*, name: str, **options: Any) -> gymnasium.Env[Any, Any]:
-    """Return a single environment; arguments as `make_vector` takes them."""
+    """Return a single environment; arguments as for `make_vector`."""
     from drive_env.envs.vector_environment import SingleEnvironment
 
     return SingleEnvironment(make_vector(1, name=name, autoreset_mode="Disabled", **options))
@@ -89,9 +89,9 @@ def make_vec_env(name: str, num_envs: int = 8, **options: Any) -> VecEnv:
     """Return a VecEnv of Stable-Baselines3, with the episodes' returns for its log.
 
     Args:
-        name: As it is registered, e.g. "ServoDrive/GantryBeam-v1".
+        name: Its registered name, e.g. "ServoDrive/GantryBeam-v1".
         num_envs: Number of environments.
-        options: Of the environment.
+        options: Options of the environment.
 
     Raises:
         ValueError: For an unknown name; ImportError without Stable-Baselines3 (the extra `agents`).

@@ -1,8 +1,8 @@
-"""What a bus does to set-points and measurements on their way: latency, jitter, lost SYNCs, in communication cycles.
+"""Effects of a bus on set-points and measurements: latency, jitter, lost SYNCs, in communication cycles.
 
-In cycle k the master sends an action and the drives act on the newest that has arrived; the measurement of cycle k
-sets out and the master sees the newest that has arrived. Messages do not overtake each other. Without a SYNC the drives
-neither latch what has arrived nor sample: the last action goes on, the last measurement stands.
+In cycle k the master sends an action and the drives act on the newest that has arrived; the measurement of cycle k is
+sent, and the master sees the newest that has arrived. Messages do not overtake each other. Without a SYNC the drives
+neither apply arrived actions nor sample: the last action and measurement stay.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
-# Marks of the chances that a cycle has; the cycle's number is added.
+# Marks of a cycle's random numbers; the cycle's number is added.
 _LOST, _ACTION, _OBSERVATION = (k << 40 for k in (1, 2, 3))
 
 
 class BusDelays(Saved):
-    """The delays of every environment's bus; an environment's chance follows from its generator alone.
+    """The delays of every environment's bus; an environment's random numbers follow only from its generator.
 
     Args:
         num_envs: Number of environments.
-        deepest: Longest latency and jitter together that an environment can have [communication cycles].
+        deepest: Largest possible sum of latency and jitter [communication cycles].
 
-    Compiled code passes messages on by `pass_on`, with the lines' addresses.
+    Compiled code calls `pass_on` with the lines' addresses.
     """
 
     STATE = ("actions", "observations", "is_there")
@@ -44,7 +44,7 @@ class BusDelays(Saved):
         self._lost_sync = np.zeros(num_envs)
         self.actions = _new_line(_ACTION, self._keys, self._lost_sync, deepest)
         self.observations = _new_line(_OBSERVATION, self._keys, self._lost_sync, deepest)
-        self.is_there = False  # whether any environment's bus does anything: without, all arrives at once
+        self.is_there = False  # whether any environment's bus delays or loses anything: if not, all arrives at once
 
     def reset(
         self,
@@ -54,19 +54,19 @@ class BusDelays(Saved):
         observation: NDArray[Any],
         where: Mask | None = None,
     ) -> None:
-        """Begin anew in the environments where the mask is true.
+        """Restart the environments where the mask is true.
 
         Args:
-            values: `RandomMachines.values`, of which those of the bus are used: "bus.action_latency",
-                "bus.observation_latency", "bus.jitter" (the most that a message takes longer) [communication cycles],
-                "bus.lost_sync" (probability per cycle); each of shape (num_envs,).
-            rngs: The environments' generators; one number is taken from each environment's that begins.
-            action: What acts until the first action arrives, shape (num_envs, ...).
-            observation: What is seen until the first measurement arrives, shape (num_envs, ...).
+            values: `RandomMachines.values`, of which the bus uses "bus.action_latency", "bus.observation_latency",
+                "bus.jitter" (largest additional delay of a message) [communication cycles], "bus.lost_sync"
+                (probability per cycle); each of shape (num_envs,).
+            rngs: The environments' generators; one number is taken from that of each starting environment.
+            action: Acts until the first action arrives, shape (num_envs, ...).
+            observation: Seen until the first measurement arrives, shape (num_envs, ...).
             where: Environments.
 
         Raises:
-            ValueError: For delays deeper than these lines are, or negative ones.
+            ValueError: For negative delays, or larger ones than `deepest`.
         """
         mask = np.ones(len(self._keys), bool) if where is None else where
         for lane in map(int, np.flatnonzero(mask)):
@@ -80,11 +80,11 @@ class BusDelays(Saved):
         self.is_there = bool(self._lost_sync.any()) or self.actions.is_there or self.observations.is_there
 
     def act(self, actions: NDArray[Any]) -> NDArray[Any]:
-        """Send actions in some cycles, shape (cycles, num_envs, ...); return those that the drives act on in each."""
+        """Send actions of some cycles, shape (cycles, num_envs, ...); return those that the drives apply in each."""
         return self.actions.pass_on(actions) if self.is_there else actions
 
     def act_unlatched(self, actions: NDArray[Any]) -> NDArray[Any]:
-        """Send what needs no SYNC to act, as an SDO does not: a lost one does not hold it up."""
+        """Send actions that need no SYNC to act, such as SDO writes: a lost SYNC does not delay them."""
         return self.actions.pass_on(actions, latched=False) if self.is_there else actions
 
     def observe(self, observations: NDArray[Any]) -> NDArray[Any]:
@@ -94,10 +94,10 @@ class BusDelays(Saved):
 
 @dataclass(eq=False)
 class Line(Bundle):
-    """Messages under way of every environment, in one direction; as doubles, which hold all integers of 32 bits."""
+    """Messages under way of every environment in one direction, as doubles, which hold all integers of 32 bits."""
 
-    keys: Annotated[NDArray[np.uint64], types.uint64[::1]]  # of chance, (num_envs,)
-    mark: int  # of this direction's chances
+    keys: Annotated[NDArray[np.uint64], types.uint64[::1]]  # of random numbers, (num_envs,)
+    mark: int  # of this direction's random numbers
     lost_sync: Vector  # probability per cycle, (num_envs,)
     latency: Numbers  # [communication cycles]
     jitter: Numbers
@@ -113,7 +113,7 @@ class Line(Bundle):
         return bool(self.latency.any() or self.jitter.any())
 
     def reset(self, latency: Floats, jitter: Floats, first: NDArray[Any], where: Mask) -> None:
-        """Begin anew in the environments where the mask is true, with the message that stands before the first one."""
+        """Restart the environments where the mask is true, with the message that counts before the first one."""
         lanes, width, depth = len(where), first[0].size, self.arrivals.shape[1]
         if self.held.shape[1] != width:
             self.replace(messages=np.zeros((lanes, depth, width)), held=np.zeros((lanes, width)))
@@ -133,7 +133,7 @@ class Line(Bundle):
         self.held[where] = begun[where]
 
     def pass_on(self, messages: NDArray[Any], latched: bool = True) -> NDArray[Any]:
-        """Return the messages that have arrived in each cycle, of those sent in them, shape (cycles, num_envs, ...)."""
+        """Send messages in cycles, shape (cycles, num_envs, ...); return those that have arrived by each cycle."""
         sent = np.ascontiguousarray(messages, float).reshape(*messages.shape[:2], -1)
         arrived = np.empty_like(sent)
         _pass_rows_on(self.address, sent, arrived, latched)
@@ -165,7 +165,7 @@ def _share(key: Any, mark: Any) -> Any:
 
 @stage
 def pass_on(line: Any, lane: Any, message: Any, latched: Any) -> None:
-    """Begin a cycle of an environment with a message, shape (width,); `line.held` is what has arrived by then."""
+    """Begin a cycle of an environment with a message, shape (width,); `line.held` becomes the last arrived one."""
     held, latency, jitter, lost = line.held, line.latency[lane], line.jitter[lane], line.lost_sync[lane]
     if latency == 0 and jitter == 0 and (lost == 0.0 or not latched):
         for part in range(message.shape[0]):

@@ -1,4 +1,4 @@
-"""A payload that changes while machines run: which parameter of the load it is, its times and its values."""
+"""A payload that changes while machines run: the parameter of the load, its times and values."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ if TYPE_CHECKING:
     from mechanics.load import Load
 
 
-PAYLOADS = ("load.payload", "load.mass", "load.inertia")  # which "auto" takes: the first there is
+PAYLOADS = ("load.payload", "load.mass", "load.inertia")  # candidates for "auto": the first that the load has
 NO_PAYLOAD = "none"
 
 
 class Payload(NamedTuple):
-    """The parameter that changes, or "none", and the range of its factor on the nominal value."""
+    """The changing parameter, or "none", and the range of its factor on the nominal value."""
 
     name: str
     low: float
@@ -29,13 +29,13 @@ class Payload(NamedTuple):
 
 
 def find_payload(load: Load, chosen: str, low: float | None, high: float | None) -> Payload:
-    """Return the payload of a load: which parameter changes, and in which range.
+    """Return the payload of a load: the changing parameter and its range.
 
     Args:
-        load: The row.
-        chosen: A parameter's name; "auto" for the load's payload, mass or inertia, "none" for nothing.
-        low: Of the factor's range; None is the load's own.
-        high: Likewise.
+        load: The load.
+        chosen: A parameter's name; "auto" for the load's payload, mass or inertia, "none": no change.
+        low: Lower end of the factor's range; None: the load's own.
+        high: Upper end, likewise.
 
     Raises:
         ValueError: For an unknown parameter, naming the known ones, or an invalid range.
@@ -54,19 +54,19 @@ def find_payload(load: Load, chosen: str, low: float | None, high: float | None)
 
 
 class PayloadChanges(Saved):
-    """The times and values of each machine's payload in an episode: one change in each of its equal parts.
+    """The times and values of each machine's payload in an episode: one change in each of `count` equal parts.
 
     Args:
-        payload: What changes.
-        machines: Emulated ones, one per environment, with the nominal value.
+        payload: The changing parameter.
+        machines: Emulated machines, one per environment, with the nominal value.
         num_envs: Number of environments.
-        steps: Of an episode.
+        steps: Steps of an episode.
         count: Changes in an episode.
 
     Attributes:
-        nominal: The payload's value that a factor of 1 means, shape (num_envs,); of a payload alone.
+        nominal: The payload's value at a factor of 1, shape (num_envs,); only with a payload.
         at: Step of each change, shape (num_envs, count).
-        factor: On the nominal value, from then on, shape (num_envs, count).
+        factor: New factor on the nominal value, shape (num_envs, count).
     """
 
     STATE = ("at", "factor")
@@ -90,7 +90,7 @@ class PayloadChanges(Saved):
             self.factor[lane] = low * (high / low) ** chance[1]
 
     def apply(self, now: Integers, parameters: dict[str, Floats]) -> dict[str, Floats]:
-        """Give the environments whose time has come another payload; one that cannot be stepped keeps the one it has.
+        """Change the payload of environments in which a change is due, unless the new machine could not be stepped.
 
         Args:
             now: The environments' present step, shape (num_envs,).

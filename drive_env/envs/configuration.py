@@ -24,7 +24,7 @@ def _is_whole(value: Any) -> bool:
     return not isinstance(value, bool) and isinstance(value, Integral)
 
 
-# Type of a field -> what it takes, in words, and whether a value is one; fields of other types check themselves.
+# Type of a field -> its description, and the check of a value; fields of other types check themselves.
 _KINDS: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "str": ("text", lambda value: isinstance(value, str)),
     "str | Motor": ("a motor's name, the path of its file, or a Motor", lambda value: isinstance(value, (str, Motor))),
@@ -33,7 +33,7 @@ _KINDS: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "bool": ("true or false", lambda value: isinstance(value, bool)),
     "tuple[str, ...]": (
         "a list of names",
-        # A lone name, too: the dataclass says which there are.
+        # Also a single name: the dataclass knows the valid ones.
         lambda value: isinstance(value, str | list | tuple) and all(isinstance(one, str) for one in value),
     ),
     "Mapping[str, float]": (
@@ -49,12 +49,12 @@ def configured(
     """Return a configuration of a dataclass.
 
     Args:
-        kind: The dataclass; it checks its values itself.
-        source: One of it, a table, the path of a TOML file, or None for the defaults.
+        kind: The dataclass, which checks its values itself.
+        source: An instance, a table, the path of a TOML file, or None for the defaults.
         options: Fields that replace the source's.
 
     Raises:
-        ValueError: For a field that there is not, naming those that there are, or a file that is not TOML.
+        ValueError: For an unknown field, naming the known ones, or a file that is not TOML.
     """
     if source is None:
         table: dict[str, Any] = {}
@@ -74,13 +74,13 @@ def configured(
     for field in fields(kind):  # type: ignore[arg-type]
         if field.name in table:
             if str(field.type).startswith("float") and table[field.name] in ("inf", "-inf"):
-                table[field.name] = float(table[field.name])  # JSON has no infinity: a file of an agent says it so
+                table[field.name] = float(table[field.name])  # JSON has no infinity: an agent's file has it as text
             _check_type(field.name, str(field.type), table[field.name])
     return kind(**table)
 
 
 def _check_type(name: str, kind: str, value: Any) -> None:
-    """Raise ValueError unless a value is of a field's type, as it stands in the dataclass."""
+    """Raise ValueError unless a value is of the field's type in the dataclass."""
     optional = kind.endswith(" | None")
     if optional and value is None:
         return

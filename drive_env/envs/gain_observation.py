@@ -44,13 +44,13 @@ LEFT = ObservationRow("trials left", "those of an episode", 0.0, 1.0)
 
 
 def rows_of(axes: int, gains: int, waveform: int, highest: int) -> list[ObservationRow]:
-    """Return the entries: of each axis in turn, of the last trial before the incumbent's, then of the environment.
+    """Return the entries: those of each axis, then those of the environment; the last trial's before the incumbent's.
 
     Args:
-        axes: Of the environment.
-        gains: How many the action changes.
+        axes: Number of axes.
+        gains: Number of gains in the action.
         waveform: Points of the last move's error.
-        highest: The greatest integer of any gain.
+        highest: Greatest integer of any gain.
     """
     log_gain = ObservationRow("ln of a gain over the rule's", "1", -math.log(highest), math.log(highest))
     axis = [*IDENTIFIED, *[log_gain] * (2 * gains), *TRIED, *TRIED, *[WAVE] * waveform]
@@ -75,7 +75,7 @@ def tried_entries(tried: Trial, following: Floats, measured: Floats) -> Floats:
 
     Args:
         tried: The trial.
-        following: That of the rule's trial, shape (phases, num_axes).
+        following: The following error of the rule's trial, shape (phases, num_axes).
         measured: J by measured terms of each axis's environment, shape (num_axes,).
     """
     terms = tried.terms

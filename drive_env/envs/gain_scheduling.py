@@ -44,7 +44,7 @@ CYCLE = 0.001  # s, communication cycle
 STEPS = (0.005, 0.020)  # s, shortest and longest time between two sets of gains
 MODES = ("csp", "csv")
 BASES = ("rule", "middle", "present")
-ROUGH = 0.03  # increment of current from sample to sample, of rated: DESIGN's score counts it so
+ROUGH = 0.03  # increment of current between samples, of rated current: DESIGN's score counts it so
 
 POSITION, VELOCITY, CURRENT, STATUSWORD = (
     (cia402.POSITION_ACTUAL, 0),
@@ -130,7 +130,7 @@ class GainSchedulingConfig:
         check_choice("mode", self.mode, MODES)
         check_choice("excitation", self.excitation, EXCITATIONS)
         check_choice("base", self.base, BASES)
-        # What payloads change: the gains of a current loop are computed from R and L, and are no part of it.
+        # Gains of a current loop depend on R and L, not on the payload.
         outer = find_device(self.device).gains.outer
         if self.gains is not None and (
             isinstance(self.gains, str) or not self.gains or len(set(self.gains)) != len(self.gains)
@@ -168,7 +168,7 @@ class GainSchedulingConfig:
 
 
 def base_inertia(config: GainSchedulingConfig) -> Floats:
-    """Return the inertia that the base's gains are for, rotor included [kg*m^2], shape (axes,); not of "present"."""
+    """Return the inertia for the base's gains, rotor included [kg*m^2], shape (axes,); not for "present"."""
     row = find_load(config.load)
     payload = find_payload(row, config.payload, config.payload_low, config.payload_high)
     rotor, load = config.motor_row.inertia, shaft_load(one(row)).inertia[0]
@@ -274,7 +274,7 @@ class GainScheduling(VectorEnvironment):
         self._steps = round(self.config.duration / self.config.step)
         self._action: Floats = np.zeros(0)  # of every axis
         nothing = np.zeros((self._cycles, num_envs * self._axes))
-        self._samples = nothing, nothing, nothing  # of the last step, as they have come: error, velocity, current
+        self._samples = nothing, nothing, nothing  # of the last step, as received: error, velocity, current
         self._parameters: dict[str, Floats] = {}  # the true machines
         self._margins: OnlineMargins | None = None
         c = self.config
@@ -369,7 +369,7 @@ class GainScheduling(VectorEnvironment):
         self._now = np.zeros(n, np.int64)  # steps since the environment's reset
         self._origin = np.zeros(axes, np.int64)
         self._action = np.zeros((axes, len(self.config.chosen)))
-        self._in_force = self.base_gains.copy()  # raw gains that the drives have at a step's end
+        self._in_force = self.base_gains.copy()  # raw gains of the drives at a step's end
         self._acting = np.zeros((n, self._axes), np.int64)
 
     def _prepare_scales(self, load: Load) -> None:
@@ -418,7 +418,7 @@ class GainScheduling(VectorEnvironment):
         self._payload_changes = PayloadChanges(self._payload, machine, self.num_envs, self._steps, changes)
 
     def _prepare_gains(self) -> None:
-        """Keep the raw gains of every axis that an action of 0 means, shape (num_axes, count)."""
+        """Store the raw gains of every axis for an action of 0, shape (num_axes, count)."""
         drives, device = self.drives, device_of(self.drives)
         if drives.machine is None or self.config.base == "present":
             self.base_gains = read_gains(drives)
@@ -455,7 +455,7 @@ class GainScheduling(VectorEnvironment):
         """Let the step pass; gains act when they arrive, between two cycles."""
         wanted = self._gains_of(self._action)
         play = {TARGETS[self.config.mode]: targets.reshape(self._cycles, -1)}
-        if self._machines is None:  # on a bus no PDO carries them
+        if self._machines is None:  # on a bus no PDO carries gains
             for key, values in zip(self._gain_objects, wanted.T, strict=True):
                 self.drives.write(key, values)
         else:
@@ -465,11 +465,11 @@ class GainScheduling(VectorEnvironment):
             self._in_force[:, self._columns] = arriving[-1]
             play |= {key: arriving[:, :, k] for k, key in enumerate(self._gain_objects)}
         objects = (POSITION, VELOCITY, CURRENT, STATUSWORD)
-        # A picture looks at every cycle.
+        # A picture is updated in every cycle.
         at_once = 1 if self._pictures is not None and self._pictures.is_looking else self._cycles
         traces = []
         with warnings.catch_warnings():
-            # A machine that leaves physics ends its environment; `info` says so.
+            # A machine that diverges ends its environment; `info` reports it.
             warnings.filterwarnings("ignore", "machine .* left the range of physics", RuntimeWarning)
             for begin in range(0, self._cycles, at_once):
                 part = {key: values[begin : begin + at_once] for key, values in play.items()}
@@ -481,7 +481,7 @@ class GainScheduling(VectorEnvironment):
     def _measured(self, targets: Integers, rows: Mapping[tuple[int, int], Integers]) -> tuple[Floats, Floats, Floats]:
         """Return error [rad or rad/s], velocity [rad/s] and current [A], each (cycles, num_axes).
 
-        A sample is compared with the set-point of the cycle before: that is where the drive had to be by then.
+        A sample is compared with the previous cycle's set-point, which the drive should have reached by then.
         """
         due = np.concatenate([self._acting[None], targets[:-1]])
         self._acting = targets[-1]
@@ -491,7 +491,7 @@ class GainScheduling(VectorEnvironment):
         return error, velocity, np.asarray(rows[CURRENT] * self._ampere, float)
 
     def _seen(self, error: Floats, velocity: Floats, current: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return the same as they reach the master."""
+        """Return error, velocity and current as received by the master."""
         if not self._bus.is_there:
             return error, velocity, current
         sampled = np.stack([error, velocity, current], 1).reshape(self._cycles, 3, self.num_envs, self._axes)
@@ -537,7 +537,7 @@ class GainScheduling(VectorEnvironment):
         return terms | {"trip": -1.0 * terminated}
 
     def _faults(self, tripped: Mask) -> Texts:
-        """Return the emergency or other cause that ended each environment, "" for those that go on."""
+        """Return the emergency or other cause that ended each environment, "" if it continues."""
         names = np.full(self.num_envs, "", object)
         if tripped.any():
             names[tripped.reshape(self.num_envs, -1).any(axis=1)] = "unknown"
@@ -556,7 +556,7 @@ class GainScheduling(VectorEnvironment):
 
     # --- on a bus -------------------------------------------------------------------------------------------------
     def _bring_back(self, axes: Mask) -> None:
-        """Take real axes back to where the first programme began."""
+        """Move real axes back to the start of the first programme."""
         if self._has_begun:
             motion.enable(self.drives, "pp", where=axes)
             motion.move_to(self.drives, self._origin, where=axes)

@@ -258,7 +258,7 @@ class GainTuning(VectorEnvironment):
             laws = laws_of(c.load, self._device, known) if c.load in shipped() else {"parameters": {}}
         self._machines = RandomMachines(emulated_of(self.drives), Distributions.load(laws))
         self._defaults = machine_of(self.drives).parameters
-        if not is_load_detection(self._device, c.chosen):  # else J by measured terms is all there is
+        if not is_load_detection(self._device, c.chosen):  # otherwise there is only J by measured terms
             self._score = new_score(
                 c.device,
                 c.load,
@@ -300,7 +300,7 @@ class GainTuning(VectorEnvironment):
             np.ones((axes, self._device.gains.count), np.int64) for _ in range(4)
         )
         self._best_is_stable = np.ones(axes, bool)
-        self._following = np.ones((len(PHASES), axes))  # the rule's
+        self._following = np.ones((len(PHASES), axes))  # of the rule's trial
         blank = np.zeros((axes, len(TRIED)))
         self._last_features, self._best_features = blank, blank.copy()
         self._wave = np.zeros((axes, c.waveform))
@@ -326,7 +326,7 @@ class GainTuning(VectorEnvironment):
         self._direction = np.where(axes, 1, self._direction)
         scaler = drives.read(Role.POSITION_SCALE)
         planned = self._method.plan(self._identified, scaler, self._reach)
-        # Environments outside the mask keep theirs: nothing of what it follows from has changed.
+        # Environments outside the mask keep theirs, since nothing that it depends on has changed.
         self._move = planned
         volts = self.motor.voltage if drives.device is None else drives.device.supply_of(self.motor)
         supply = np.full(drives.num_axes, volts)
@@ -402,10 +402,10 @@ class GainTuning(VectorEnvironment):
 
     # --- a trial --------------------------------------------------------------------------------------------------
     def _begin_trial(self, mask: Mask) -> None:
-        """Bring the drives of a trial to where it begins: enabled, in pp; emulated machines at rest at zero.
+        """Bring drives to the start of a trial: enabled, in pp; emulated machines at rest at zero.
 
-        An emulated trial begins anew so that it follows from machine, gains and the environment's noise alone, not from
-        how long other environments were being reset meanwhile.
+        An emulated machine is reset, so that its trial depends only on machine, gains and the environment's noise, not
+        on the time that resets of other environments take.
         """
         drives, axes, pictures = self.drives, np.repeat(mask, self._axes), self._pictures
         if self._machines is not None:
@@ -421,7 +421,7 @@ class GainTuning(VectorEnvironment):
         else:
             self._trials.recover(axes)
         if pictures is not None:
-            pictures.begin(mask)  # a trial at a time: between two the machine leaps back to zero
+            pictures.begin(mask)  # a recording per trial: between two the machine jumps back to zero
             self._trials.look = pictures.look if pictures.is_looking else None
 
     def _try(self, gains: Integers, mask: Mask) -> Trial:
@@ -430,23 +430,22 @@ class GainTuning(VectorEnvironment):
         fallback = np.where(self._best_is_stable[:, None], self._best, self._safe)
         direction = np.ones_like(self._direction) if self._owned else self._direction
         tried = self._trials.run(gains, fallback, self._move, self._origin, direction, axes)
-        if not (self._owned or self._trials.returns):  # it ends where its move did; the next one goes the other way
+        if not (self._owned or self._trials.returns):  # it ends where its move did; the next one goes back
             self._origin = np.where(axes, self._origin + self._direction * self._move.distance, self._origin)
             self._direction = np.where(axes, -self._direction, self._direction)
         return tried
 
     def _measure(self, gains: Integers, tried: Trial) -> Floats:
-        """Return J by measured terms of the lanes: that of the worst axis."""
+        """Return J by measured terms of each environment: that of its worst axis."""
         softness = self._method.softness
         costs = measured_cost(tried.costs(softness(gains) / softness(self._rule)))
         return np.asarray(costs.reshape(self.num_envs, -1).max(axis=1))
 
     def _stopped(self, tried: Trial) -> Mask:
-        """Return in which environments a trial was stopped, on any axis."""
         return np.asarray(tried.aborted.any(axis=0).reshape(self.num_envs, -1).any(axis=1))
 
     def _take(self, mask: Mask, gains: Integers, tried: Trial, measured: Floats, better: Mask | None = None) -> None:
-        """Keep a trial as the last one where the mask is true, and as the incumbent where it is better."""
+        """Store a trial as the last one where the mask is true, and as the incumbent where it is better."""
         better = mask if better is None else better
         axes, best = np.repeat(mask, self._axes), np.repeat(better, self._axes)
         self._last = np.where(axes[:, None], gains, self._last)

@@ -1,8 +1,8 @@
-"""The highest speed at which a stepper carries its load: there the pull-out torque is what friction takes.
+"""The highest speed of a stepper with its load: the pull-out torque there equals the friction.
 
-Beyond the speed at which the supply runs out of voltage the phase currents are no sines, and no closed form holds. They
-are integrated over some periods at constant speed: each phase gets the whole supply, one way or the other, until its
-current is where the table wants it. The pull-out torque is the greatest of all lags of the rotor behind the field.
+Above the speed at which the voltage reaches the supply, the phase currents are not sines, and no closed form holds.
+They are integrated over some periods at constant speed: each phase gets the whole supply, with either sign, until its
+current reaches that of the table. The pull-out torque is the maximum over all lags of the rotor behind the field.
 """
 
 from __future__ import annotations
@@ -19,25 +19,25 @@ from mechanics.arrays import Floats
 from mechanics.kernels.compiled import cached, stage
 
 STEPS = 160  # of the electrical period, a multiple of 4
-SETTLING = 4.0  # time constants L/R, until the currents repeat
+SETTLING = 4.0  # time constants L/R until the currents repeat
 SINES, COSINES = (of(2.0 * np.pi * np.arange(STEPS) / STEPS) for of in (np.sin, np.cos))
-LEAST_LAG, MOST_LAG = math.radians(30.0), math.radians(178.0)  # of the rotor, that the greatest torque lies between
-LAGS, SPEEDS = 8, 10  # narrowings of the lag by the golden section, of the speed by halves
-FASTEST = 2.0 * math.pi * 60.0  # rad/s, what is looked for at most
+LEAST_LAG, MOST_LAG = math.radians(30.0), math.radians(178.0)  # of the rotor, between which the greatest torque is
+LAGS, SPEEDS = 8, 10  # golden-section steps for the lag, bisections for the speed
+FASTEST = 2.0 * math.pi * 60.0  # rad/s, upper end of the search
 GOLDEN = 0.6180339887498949
-# Of a machine's parameters, those that the speed depends on; friction of motor and load is added up.
+# Parameters of a machine that the speed depends on; friction of motor and load is added.
 ELECTRICAL = ("motor.R_s", "motor.L_s", "motor.psi_m", "motor.saturation", "supply.voltage")
 
 
 def highest_speeds(motor: Motor, current: ArrayLike, parameters: Mapping[str, ArrayLike]) -> Floats:
     """Return the highest speeds [rad/s] at which machines with a disc on the shaft stay in step, (machines,).
 
-    Within 3 % of where a slow ramp of the emulator loses steps, if no resonance has shaken the rotor out before.
+    Within 3 % of the speed at which a slow ramp of the emulator loses steps, unless a resonance does so before.
 
     Args:
         motor: The stepper.
-        current: Amplitude of its phase currents [A], one or one for each machine.
-        parameters: By name, (machines,) each, as `info["parameters"]` of an environment has them.
+        current: Amplitude of its phase currents [A], one, or one per machine.
+        parameters: By name, (machines,) each, as in `info["parameters"]` of an environment.
     """
     values = {name: np.asarray(parameters[name], float) for name in ELECTRICAL}
     warmer = np.asarray(parameters["start.winding"], float) - NOMINAL
@@ -71,7 +71,7 @@ def mean_torque(n_p: int, row: Floats, speed: float, lag: float) -> float:
         free_b = i_b - dt / L * (psi * w * c + R * i_b)
         i_a = min(max(current * cosine, free_a - most), free_a + most)
         i_b = min(max(current * sine, free_b - most), free_b + most)
-        if k >= last - STEPS // 4:  # a quarter of a period on, one phase is as the other was
+        if k >= last - STEPS // 4:  # a quarter of a period later, one phase is as the other was
             torque += n_p * psi * (i_b * c - i_a * s)
     return torque / (STEPS // 4)
 

@@ -11,11 +11,11 @@ from drive_env.saved_state import Saved
 from mechanics.arrays import Floats, Integers, Mask
 
 EXCITATIONS = ("moves", "sine")
-# Of a move of least jerk, 10 s^3 - 15 s^4 + 6 s^5: peaks of speed and acceleration per distance.
+# Of a minimum-jerk move, 10 s^3 - 15 s^4 + 6 s^5: peaks of speed and acceleration per distance.
 _PEAK_SPEED, _PEAK_ACCELERATION = 1.875, 5.7735
-_SHORTEST = 0.05  # s, a move
+_SHORTEST = 0.05  # s, of a move
 _LONGEST_PAUSE = 0.15  # s between two moves
-_PACE = (0.5, 1.0)  # how hard a move is driven, of what the axis can do
+_PACE = (0.5, 1.0)  # share of the axis' capability at which a move is driven
 
 
 class Reach(NamedTuple):
@@ -32,15 +32,15 @@ class Programme(Saved):
     Args:
         num_envs: Number of environments.
         cycles: Length [cycles].
-        preview: Cycles that are known beyond it.
-        cycle: [s].
+        preview: Further known cycles after it.
+        cycle: Communication cycle [s].
     """
 
     STATE = ("_table",)
 
     def __init__(self, num_envs: int, cycles: int, preview: int, cycle: float) -> None:
         self._cycle = cycle
-        # Place, speed and acceleration of every environment as shares of the axes' distance [1, 1/s, 1/s^2].
+        # Position, speed and acceleration of every environment as shares of the axes' distance [1, 1/s, 1/s^2].
         self._table = np.zeros((3, num_envs, cycles + preview + 1))
 
     def draw(self, excitation: str, reach: Reach, rngs: Sequence[np.random.Generator], where: Mask) -> None:
@@ -56,7 +56,7 @@ class Programme(Saved):
         Args:
             start: The environments' present cycle, shape (num_envs,).
             cycles: Cycles from there on, shape (n,).
-            reach: What the axes can do.
+            reach: The axes' limits.
         """
         last = self._table.shape[2] - 1
         at = np.minimum(start[None, :] + cycles[:, None], last)

@@ -1,4 +1,4 @@
-"""How far outer loops keep the margins that are asked of them, with the gains and the payload of the moment."""
+"""Margins of outer loops with the present gains and payload, compared with required ones."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from drive_env.loops.true_plant import true_machines
 from drive_env.saved_state import Saved
 from mechanics.arrays import Floats, Integers, Mask
 
-LOWEST, POINTS = 2.0, 100  # frequencies looked at: from [Hz], how many; enough for what moves as one
+LOWEST, POINTS = 2.0, 100  # frequencies: from [Hz], number; enough for rigid machines
 
 
 class OnlineMargins(Saved):
-    """The outer loops of emulated machines against the margins of some dynamics, in every step.
+    """Compares the outer loops of emulated machines with the margins of some dynamics, in every step.
 
     Args:
-        drives: Of the machines; a device whose cascade has a linear model.
-        dynamics: Whose margins are asked for.
-        mode: "csp", both loops count, or "csv", the velocity loop alone.
+        drives: The drives, of a device whose cascade has a linear model.
+        dynamics: The required margins.
+        mode: "csp" for both loops, or "csv" for the velocity loop alone.
     """
 
     STATE = ("_plant", "_corner")
@@ -31,14 +31,14 @@ class OnlineMargins(Saved):
         true = true_machines(drives)
         count, axes = true.supply.shape
         self._f = np.tile(np.geomspace(LOWEST, HIGHEST * self._rates.velocity_rate, POINTS), (count, 1))
-        self._plant = np.zeros((count, POINTS, axes, axes), complex)  # a rotor's velocity by a demanded current
+        self._plant = np.zeros((count, POINTS, axes, axes), complex)  # rotor's velocity per demanded current
         self._corner = np.ones((count, axes))  # of the velocity filters [Hz]
 
     def take_in(self, raw: Integers, where: Mask) -> None:
-        """Linearise machines as they are now.
+        """Linearise machines in their present state.
 
         Args:
-            raw: Gains of all axes, of which those of the current loops count, (num_axes, count).
+            raw: Gains of all axes, of which those of the current loops are used, (num_axes, count).
             where: Machines, (machines,).
         """
         found = LinearMachines(*(part[where] for part in true_machines(self._drives)))
@@ -47,13 +47,13 @@ class OnlineMargins(Saved):
         self._corner[where] = found.velocity_filter
 
     def share(self, raw: Integers) -> Floats:
-        """Return the least clearance (`Dynamics`) of each machine's loops with these gains, cut to 0...1, (machines,).
+        """Return the least clearance (`Dynamics`) of each machine's loops with these gains, within 0...1, (machines,).
 
-        It is 1 where all margins are kept, 0 where a loop is unstable.
+        It is 1 if all margins are kept, 0 if a loop is unstable.
         """
         every = np.ones(len(self._f), bool)
         loops = loops_around(self._rates, self._plant, self._corner, self._gains(raw, every), self._f)[: self._loops]
-        # Stable loops turn around -1 by nothing: their phase comes back to where it begins.
+        # Stable loops do not encircle -1: their phase returns to its start.
         turned = [np.unwrap(np.angle(1.0 + loop), axis=-1)[..., -1] for loop in loops]
         kept = [np.where(np.abs(turn) < 0.5 * np.pi, self._dynamics.clearance(loop), 0.0)
                 for turn, loop in zip(turned, loops, strict=True)]  # fmt: skip

@@ -1,4 +1,4 @@
-"""Pictures of environments: the machine beside its scope, as a film shows them, while an episode runs."""
+"""Pictures of environments: the machine beside its scope while an episode runs."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Pictures:
         period: Time between two looks [s].
 
     Raises:
-        ValueError: For drives on a bus, whose machine no one sees.
+        ValueError: For drives on a bus, whose machine is not visible.
         OpenGLError: With "human", if there is no display.
     """
 
@@ -45,7 +45,7 @@ class Pictures:
 
     @property
     def is_looking(self) -> bool:
-        """Whether an environment is recorded: only then is `look` worth a call."""
+        """Whether an environment is recorded: only then `look` need be called."""
         return bool(self._recorders)
 
     def begin(self, lanes: Mask) -> None:
@@ -55,7 +55,7 @@ class Pictures:
             self._record(lane)
 
     def look(self, wanted: tuple[Floats, Floats] | None = None) -> None:
-        """Record position and set-point of the environments that are shown, as `Recorder.look` takes it."""
+        """Record position and set-point of the shown environments, with the argument of `Recorder.look`."""
         for recorder in self._recorders.values():
             recorder.look(wanted)
         if self._window is not None and self._recorders:
@@ -77,7 +77,7 @@ class Pictures:
         return None
 
     def close(self) -> None:
-        """Close window and picture."""
+        """Close the window and the picture."""
         if self._window is not None:
             self._window.close()
         if self._picture is not None:

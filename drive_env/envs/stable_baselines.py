@@ -18,9 +18,9 @@ from drive_env.envs.vector_environment import Info, VectorEnvironment
 class DriveVecEnv(VecEnv):  # type: ignore[misc]
     """Stable-Baselines3's view of environments with autoreset mode "SameStep".
 
-    Observations, rewards and ends are handed over as they are; infos are dicts with "terminal_observation",
-    "TimeLimit.truncated", "fault" of environments that ended, and empty otherwise. Where the distributions have a
-    curriculum, its stage follows the steps of all environments.
+    Observations, rewards and ends are passed on unchanged; infos are dicts with "terminal_observation",
+    "TimeLimit.truncated", "fault" for environments that ended, otherwise empty. If the distributions have a curriculum,
+    its stage follows the steps of all environments.
 
     Raises:
         ValueError: For environments of another autoreset mode, which SB3 does not know.
@@ -37,7 +37,7 @@ class DriveVecEnv(VecEnv):  # type: ignore[misc]
 
     def reset(self) -> Any:
         """Begin an episode in every environment, with the seeds and options given before."""
-        seed = self._seeds[0] if self._seeds else None  # the others are this one and a count, which would be less apart
+        seed = self._seeds[0] if self._seeds else None  # the others are only counted up from it
         options = self._options[0] if self._options and self._options[0] else None
         self._follow_curriculum()
         observation, told = self.vector.reset(seed=seed, options=options)
@@ -47,7 +47,7 @@ class DriveVecEnv(VecEnv):  # type: ignore[misc]
         return observation
 
     def step_async(self, actions: Any) -> None:
-        """Take the actions."""
+        """Store the actions for `step_wait`."""
         self._actions = actions
 
     def step_wait(self) -> tuple[Any, Any, Any, list[Info]]:
@@ -71,11 +71,11 @@ class DriveVecEnv(VecEnv):  # type: ignore[misc]
             self.vector.stage = self.vector.curriculum.stage_at(self._steps)
 
     def close(self) -> None:
-        """Give drives and pictures back."""
+        """Release drives and pictures."""
         self.vector.close()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """Return an attribute of the environments, once per environment asked for."""
+        """Return an attribute of the environments, once per requested environment."""
         return [getattr(self.vector, attr_name)] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
@@ -83,7 +83,7 @@ class DriveVecEnv(VecEnv):  # type: ignore[misc]
         setattr(self.vector, attr_name, value)
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
-        """Call a method of the environments once, and return its result once per environment asked for."""
+        """Call a method of the environments once, and return its result once per requested environment."""
         result = getattr(self.vector, method_name)(*method_args, **method_kwargs)
         return [result] * len(list(self._get_indices(indices)))
 
@@ -97,7 +97,6 @@ class DriveVecEnv(VecEnv):  # type: ignore[misc]
 
 
 def _of_environment(info: Mapping[str, Any], lane: int) -> Info:
-    """Return one environment's part of an info."""
     found: Info = {}
     for key, value in info.items():
         if key.startswith("_") or value is None or (f"_{key}" in info and not info[f"_{key}"][lane]):

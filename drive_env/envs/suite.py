@@ -1,8 +1,8 @@
 """The suite of learning tasks, `ServoDrive/...-v1`: each is a configuration of an environment that never changes.
 
-A task has everything in it: device, load, mode, action, distributions, horizon and reward. Its reward per step lies in
-0...1: hardly anything for a motor at rest, nothing after a fall or a trip, which end the episode, and 1 for what is
-perfect. The score of an episode is the sum over the horizon's steps.
+A task is complete: device, load, mode, action, distributions, horizon and reward. Its reward per step lies in 0...1:
+near 0 for a motor at rest, 0 after a fall or a trip, which end the episode, and 1 for a perfect step. The score of an
+episode is the sum over the horizon's steps.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 from math import inf, pi
 from typing import Any
 
-# Terms of Tracking's reward that each of its tasks names, with weight 0 but its own. A term that came later stays away
-# unless it is a task's own, since it would change what is published: without a weight it has none.
+# Terms of Tracking's reward, all of which a task lists, with weight 0 except its own. A later term is not added here
+# unless it is a task's own, since that would change published tasks: without a weight it counts 0.
 TERMS = ("tracking", "speed", "load", "carried", "effort", "smoothness", "trip")
 
 
@@ -21,10 +21,10 @@ TERMS = ("tracking", "speed", "load", "carried", "effort", "smoothness", "trip")
 class SuiteTask:
     """A task of the suite.
 
-    environment: The configurable environment that it is a configuration of.
-    about: What an agent does there.
+    environment: The environment that it configures.
+    about: Description of the task.
     steps: Actions of an episode.
-    solved: Score above which an agent does what the expert cannot, 0...1; the reward threshold is that times `steps`.
+    solved: Score above which an agent surpasses the expert, 0...1; the reward threshold is that times `steps`.
     options: The configuration.
     """
 
@@ -46,7 +46,7 @@ def _tracking(about: str, solved: float, reward: str, load: str, duration: float
 def _scheduling(about: str, solved: float, **options: Any) -> SuiteTask:
     """Return a task of GainScheduling on a disc whose inertia changes by 1 : 45, rotor included.
 
-    Margins are those of soft dynamics, in numbers, which no later table changes.
+    The margins are those of soft dynamics as numbers, so that later changes of the table have no effect.
     """
     weights = {"tracking": 1.0, "smoothness": 0.0, "trip": 0.0}
     own = {"load": "inertia", "distributions": "payload", "duration": 2.0, "step": 0.01, "base": "middle",
@@ -61,7 +61,7 @@ def _tuning(about: str, solved: float, load: str, laws: Any, gains: tuple[str, .
 
 
 def _log(low: float, high: float) -> dict[str, Any]:
-    """Return the law of a parameter between these multiples of its default."""
+    """Return the distribution of a parameter between these multiples of its default."""
     return {"law": "loguniform", "low": low, "high": high, "of": "default"}
 
 
@@ -70,7 +70,8 @@ def _even(low: float, high: float) -> dict[str, Any]:
 
 
 CASCADE = ("velocity_p", "velocity_i", "position_p")
-# A geared joint of 16 times the inertia, stiffness and friction, for motors of 2 N m; what amplifiers on mains lack.
+# A geared joint of 16 times the inertia, stiffness and friction, for motors of 2 N m; without parameters that
+# amplifiers on mains lack.
 LARGE_JOINT = {
     "include": ["geared_joint", "servo_mains"],
     "parameters": {
@@ -132,14 +133,14 @@ TASKS: dict[str, SuiteTask] = {
     ),
 }  # fmt: skip
 
-FREE = ("num_threads",)  # options that change nothing but the time that a task takes
+FREE = ("num_threads",)  # options that change only the time that a task takes
 
 
 def task_options(name: str, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a task's configuration with the options of a run that may be given besides.
+    """Return a task's configuration with the free options of a run.
 
     Raises:
-        ValueError: For an option that is the task's own.
+        ValueError: For an option that the task fixes.
     """
     task = TASKS[name]
     for option in given:

@@ -44,19 +44,19 @@ OBJECTS = {
     "cst": (cia402.TARGET_TORQUE, cia402.TORQUE_OFFSET),
 }
 SAMPLED = (cia402.STATUSWORD, cia402.POSITION_ACTUAL, cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL)
-# Of a stepper, which is not asked for a current: how far the rotor is behind its steps tells the torque.
+# For a stepper, which has no target current: the rotor's lag behind its steps shows the torque.
 SAMPLED_OF_STEPPERS = (*SAMPLED[:3], cia402.POSITION_DEMAND)
-ENCODER, ENCODER_OFF = 0, -1  # of 606Ah
+ENCODER, ENCODER_OFF = 0, -1  # values of 606Ah
 WEIGHTS = {"tracking": 1.0, "speed": 0.2, "load": 1.0, "carried": 0.0, "effort": 0.05, "smoothness": 0.05, "pace": 0.0,
            "trip": 10.0}  # fmt: skip
 TERMS = tuple(WEIGHTS)
 RATES = (500, 1000)
-WITHIN_TRAVEL = 0.8  # of an axis' travel to its end stops: what a trajectory uses at most
+WITHIN_TRAVEL = 0.8  # of an axis' travel to its end stops: the most that a trajectory uses
 ACTIONS = ("direct", "offset", "ramp")
 RETURN_SPEED = 0.25  # of the trajectory's, back to the start on a bus
-RESTARTS = 3  # tries to go back to the start on a bus: what brakes in haste may trip once more
+RESTARTS = 3  # tries to return to the start on a bus: hasty braking may trip once more
 RESET_PAUSE, RESET_TIME = 0.1, 2.0  # s between two fault resets, and in all: a filled DC link empties slowly
-REST_SPEED, REST_TIME = 0.02, 0.5  # of the trajectory's speed: at rest; s that it may take
+REST_SPEED, REST_TIME = 0.02, 0.5  # of the trajectory's speed, below which it is at rest; s allowed until then
 
 
 @dataclass(frozen=True)
@@ -65,10 +65,10 @@ class Task:
 
     mode: csp, csv or cst.
     trajectory: A row of trajectories.TRAJECTORIES.
-    amplitude: Of the trajectory, and the scale of positions [rev of the motor].
-    speed: Its highest, and the scale of velocities [rev/s].
-    joint: Number of the load's joint that a sensor of the master's own sees; None for no such sensor.
-    length: Of its pendulum, from the pivot to the bob [m].
+    amplitude: Amplitude of the trajectory, and the scale of positions [rev of the motor].
+    speed: Its highest speed, and the scale of velocities [rev/s].
+    joint: Number of the load's joint with a sensor of the master; None: no such sensor.
+    length: Length of its pendulum, from the pivot to the bob [m].
     fall: Angle of that joint that ends the episode [rad].
     together: Whether all axes follow one trajectory, as the ends of one beam must.
     """
@@ -94,7 +94,7 @@ STEPPER_SPEED = 5.0  # rev/s of a stepper at most: beyond it torque falls
 
 
 def of_stepper(task: Task) -> Task:
-    """Return a task as a stepper can do it: by position in place of torque, at a speed at which it has torque."""
+    """Return a task adapted to a stepper: position instead of torque, at a speed at which it has torque."""
     return replace(task, mode="csp" if task.mode == "cst" else task.mode, speed=min(task.speed, STEPPER_SPEED))
 
 
@@ -215,12 +215,12 @@ class TrackingConfig:
 
 
 def turns_steppers(device: Device | None) -> bool:
-    """Return whether drives have a stepper's objects: positions in microsteps, no current limit in amperes."""
+    """Return whether drives are stepper drives: positions in microsteps, no current limit in amperes."""
     return device is not None and Role.FULL_STEPS in device.roles and Role.CURRENT_LIMIT not in device.roles
 
 
 def _check_device(device: Device | None, mode: str) -> None:
-    """Raise ValueError for drives that lack an observed object, or such a mode."""
+    """Raise ValueError for drives that lack an observed object, or the mode."""
     if device is None or ((cia402.TORQUE_ACTUAL, 0) in device.bindings and Role.CURRENT_LIMIT in device.roles):
         return
     if not turns_steppers(device):
@@ -354,7 +354,7 @@ class Tracking(VectorEnvironment):
         return Box(-bound, bound, dtype=np.float32), Box(-1.0, 1.0, (axes,), np.float32)
 
     def _new_machines(self) -> RandomMachines | None:
-        """Return the emulated machines as drawn; None on a bus, whose drives must have the observed objects."""
+        """Return the drawn emulated machines; None on a bus, whose drives must have the observed objects."""
         distributions, machine = self.config.distributions, self.drives.machine
         if machine is not None:
             if isinstance(distributions, str) and distributions in shipped():
@@ -370,7 +370,7 @@ class Tracking(VectorEnvironment):
         config, drives, n = self.config, self.drives, self.num_envs
         machine = drives.machine
         self._machines = self._new_machines()
-        self._causes: list[list[str]] = [[] for _ in range(n)]  # of each environment's episode: its emergencies
+        self._causes: list[list[str]] = [[] for _ in range(n)]  # the emergencies of each environment's episode
         self._sensor = sensor
         if self._has_sensor and sensor is None:
             if machine is None:
@@ -474,7 +474,7 @@ class Tracking(VectorEnvironment):
         neutral = samples[1] if self._acts_on_position else np.zeros(len(axes), np.int64)
         own.last[axes] = 0.0
         own.target[axes] = 0.0
-        # What is seen until the first sample comes: the drives at rest, of no cycle yet.
+        # Observation until the first sample arrives: the drives at rest, before the first cycle.
         seen = np.full((self.num_envs, len(SAMPLED) * self._axes + 1), -1.0)
         if self._is_stepper:
             samples[3] -= samples[1]
@@ -496,14 +496,14 @@ class Tracking(VectorEnvironment):
         return observation, {"parameters": {name: values.copy() for name, values in self._machines.values.items()}}
 
     def _arms(self) -> Floats:
-        """Return how far the bobs are beside their axes at a right angle [inc], shape (num_envs,)."""
+        """Return the bobs' distance from their axes at a right angle [inc], shape (num_envs,)."""
         machine = self.drives.machine
         length = self.config.task.length if machine is None else machine.parameters["load.length"]
         per_metre = find_load(self.config.load).gears[0] / (2.0 * np.pi)
         return np.asarray(length * per_metre * self._per_turn.reshape(self.num_envs, -1)[:, 0])
 
     def _tilt(self, mask: Mask) -> None:
-        """Let go of the pendulums at angles that are drawn."""
+        """Release the pendulums at drawn angles."""
         joint, (low, high) = self.config.task.joint, self.config.tilt
         if joint is not None and high > low:
             angles = np.zeros(self.num_envs)
@@ -512,7 +512,7 @@ class Tracking(VectorEnvironment):
             emulated_of(self.drives).machine.place(joint, angles, mask)
 
     def _find_fastest(self, mask: Mask) -> None:
-        """Find the speeds that a pace is a share of, where they are the machines' own."""
+        """Compute the machines' highest speeds, if "pace" is relative to them."""
         config, device = self.config, device_of(self.drives)
         if not (config.weights["pace"] and device.gains.is_open_loop and find_load(config.load).name == "inertia"):
             return
@@ -534,7 +534,7 @@ class Tracking(VectorEnvironment):
         return bool(own.ended[0].any())
 
     def _followed(self) -> tuple[Floats, Floats]:
-        """Return the reference for how the drives stand now: position [inc] and velocity, (num_axes,) each."""
+        """Return the reference at the drives' present time: position [inc] and velocity, (num_axes,) each."""
         own = self._episodes
         at = np.clip(own.lanes["step"] * self.config.cycles, 0, own.reference.shape[2] - 1)
         position, velocity = own.reference[np.arange(len(own.reference)), :2, np.repeat(at, self._axes)].T
@@ -559,7 +559,7 @@ class Tracking(VectorEnvironment):
 
     # --- inside ---------------------------------------------------------------------------------------------------
     def _draw_references(self, mask: Mask, given: ArrayLike | Trajectory | None) -> None:
-        """Draw the trajectories of the environments that begin, or take those that are given for this episode."""
+        """Draw the trajectories of the starting environments, or use those given for this episode."""
         config, own = self.config, self._episodes
         length = own.reference.shape[2]
         kind = config.trajectory if given is None else given
@@ -578,7 +578,7 @@ class Tracking(VectorEnvironment):
         own.lanes["steps"][mask] = config.steps
 
     def _delays(self) -> dict[str, Floats]:
-        """Return the delays of the environments' buses, without the cycle that an answer takes anyway."""
+        """Return the delays of the environments' buses, minus the cycle that an answer takes in any case."""
         none = np.zeros(self.num_envs)
         drawn = {} if self._machines is None else self._machines.values
         found = {name: drawn.get(f"bus.{name}", none) for name in ("action_latency", "observation_latency", "jitter")}
@@ -587,7 +587,7 @@ class Tracking(VectorEnvironment):
         return delays | {"bus.lost_sync": drawn.get("bus.lost_sync", none)}
 
     def _return_to_start(self, axes: Mask) -> None:
-        """Begin as one does with a real drive: nothing else moves while these axes go back to where they began."""
+        """Move real axes back to the start, while the other axes do not move."""
         drives, mode = self.drives, str(self.config.mode)
         for name in OBJECTS[mode]:
             if name != cia402.TARGET_POSITION:
@@ -604,7 +604,7 @@ class Tracking(VectorEnvironment):
                 return
 
     def _come_to_rest(self, axes: Mask) -> None:
-        """Hold still in csp: the slope of a last leap of the target would else be the speed that pp begins with."""
+        """Hold the position in csp: otherwise the slope of the target's last step would be the initial speed of pp."""
         if self.config.mode != "csp" or not self._has_begun:
             return
         drives = self.drives
@@ -638,7 +638,7 @@ class Tracking(VectorEnvironment):
         motion.enable(drives, mode=mode, where=axes)
 
     def _clear(self, axes: Mask) -> None:
-        """Reset faults of the drives that have one, when their causes are gone."""
+        """Reset the faults of drives, once their causes are gone."""
         drives = self.drives
         tries = round(RESET_TIME / RESET_PAUSE)
         for attempt in range(tries):

@@ -1,4 +1,4 @@
-"""What Tracking does in each step, compiled: from actions to set-points, from samples to observation and reward."""
+"""Each step of Tracking as compiled code: actions to set-points, samples to observation and reward."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from mechanics.kernels.compiled import cached, inlined, stage
 # An environment's episode: step and number of steps; the pendulum's angle at the last step [rad]; whether it fell.
 LANE = np.dtype([("step", "i8"), ("steps", "i8"), ("angle", "f8"), ("fallen", "i8")])
 
-AXIS_HIGH = np.array([4.0, 4.0, 4.0, 4.0, 4.0, 2.0, 2.0, 1.0])  # of the entries of an axis, -low as well
+AXIS_HIGH = np.array([4.0, 4.0, 4.0, 4.0, 4.0, 2.0, 2.0, 1.0])  # upper limits of an axis' entries; -these are the lower
 LOAD_HIGH = np.array([np.pi, 50.0])
 PREVIEW = 10  # cycles
-LONGEST_DELAY = 10  # cycles, and as many of jitter
-COMMISSIONED_INERTIA = 3.0  # rotor inertias: what the presets were computed for
+LONGEST_DELAY = 10  # cycles; jitter may add as many
+COMMISSIONED_INERTIA = 3.0  # rotor inertias for which the presets were computed
 
-# Where an error is worth 0.1 of a term: of amplitude, of speed, rad, of the current limit, of the action.
+# Errors worth 0.1 of a term: of amplitude, of speed, rad, of the current limit, of the action.
 MARGINS = {"tracking": 0.25, "speed": 0.5, "load": 0.2, "effort": 1.0, "smoothness": 1.0}
 
-# (mode, action) -> how set-points are made.
+# (mode, action) -> kind of set-points.
 DIRECT, DIRECT_POSITION, OFFSET_POSITION, OFFSET_VELOCITY, OFFSET_TORQUE, RAMP, RAMP_POSITION = range(7)
 KINDS = {("csp", "direct"): DIRECT_POSITION, ("csv", "direct"): DIRECT, ("cst", "direct"): DIRECT,
          ("csp", "offset"): OFFSET_POSITION, ("csv", "offset"): OFFSET_VELOCITY, ("cst", "offset"): OFFSET_TORQUE,
@@ -36,7 +36,7 @@ OPERATION_ENABLED = cia402.OPERATION_ENABLED
 
 @inlined
 def tolerance(error, margin):
-    """Return 1 without an error, 0.1 at the margin, and still a slope far beyond it."""
+    """Return 1 without an error, 0.1 at the margin, and still with a slope far beyond it."""
     return 1.0 / (1.0 + 9.0 * (error / margin) ** 2)
 
 
@@ -51,25 +51,25 @@ Lanes = Annotated[NDArray[np.void], types.Array(from_dtype(LANE), 1, "C")]
 
 @dataclass(eq=False)
 class Episodes(Bundle):
-    """All that a step reads and writes, of n environments with their axes; raw values are the drives' integers."""
+    """All data of a step, for n environments with their axes; raw values are the drives' integers."""
 
     lanes: Lanes  # (n,)
     action: Vector  # -1...1, (axes,)
-    scales: Matrix  # amplitude [inc], speed [606Ch], torque [what is sampled], full scale of the action, (axes, 4)
+    scales: Matrix  # amplitude [inc], speed [606Ch], torque [sampled unit], full scale of the action, (axes, 4)
     origin: Vector  # position at the episode's start [inc], (axes,)
     actions: Line  # raw values on their way to the drives, one for each of an environment's axes
-    observations: Line  # status, position, velocity, torque of each axis on their way, and their cycle's number
-    message: Matrix  # scratch, (n, as many as an observation)
-    target: Vector  # what actions of kind RAMP have added up to, raw, (axes,)
-    slope: float  # most that such a target changes by in a step, of its full scale
+    observations: Line  # status, position, velocity, torque of each axis under way, and their cycle's number
+    message: Matrix  # scratch, (n, entries of a message)
+    target: Vector  # sum of the actions of kind RAMP, raw, (axes,)
+    slope: float  # largest change of such a target in a step, of its full scale
     reference: Cube  # position [inc], velocity [inc/s], acceleration [inc/s^2], (axes, 3, cycles)
     profile_scale: Vector  # raw units of the target per unit of the reference, (axes,)
     last: Matrix  # last action and the one before, (axes, 2)
     played: NumberCube  # written: with an offset the profile's set-points, then the actions', (1 or 2, cycles, axes)
     sampled: NumberCube  # statusword, position, velocity, torque or position demand, (4, cycles, axes)
     angles: Vector  # the pendulums' [rad], (n,)
-    fastest: Vector  # speed that the pace is a share of [606Ch], (axes,)
-    arm: Vector  # how far the bob is beside the axis at a right angle [inc], (n,)
+    fastest: Vector  # speed to which the pace is relative [606Ch], (axes,)
+    arm: Vector  # the bob's distance from the axis at a right angle [inc], (n,)
     weights: Vector  # of the terms
     margins: Vector  # of MARGINS
     observation: Annotated[NDArray[np.float32], types.float32[:, ::1]]  # written, (n, entries)
@@ -77,7 +77,7 @@ class Episodes(Bundle):
     terms: Matrix  # written, (terms, n)
     ended: Annotated[NDArray[np.bool_], types.boolean[:, ::1]]  # written: terminated and truncated, (2, n)
     kind: int  # a row of KINDS
-    lags: int  # 1: the torque is told by how far the axis is behind its demand, as a stepper's is
+    lags: int  # 1: torque is the axis' lag behind its demand, as for a stepper
     fall: float  # angle that ends an episode [rad]
 
 
@@ -86,7 +86,7 @@ episodes_at = reader(Episodes)
 
 @cached(allocates=False)
 def act(address, first, count):
-    """Turn actions of some axes into the rows of set-points that act in this step's cycles."""
+    """Convert actions of some axes to the rows of set-points in this step's cycles."""
     own = episodes_at(address)
     lanes, scales, origin, actions, message = own.lanes, own.scales, own.origin, own.actions, own.message
     action, last, reference, profile_scale, played = own.action, own.last, own.reference, own.profile_scale, own.played
@@ -128,26 +128,26 @@ def act(address, first, count):
 
 @inlined
 def position_error(reference, position, origin):
-    """Return reference - position from the origin [inc], across the end of the counter of 32 bits too."""
+    """Return reference - position from the origin [inc], also across the 32-bit counter's wrap."""
     error = reference - (position - origin)
     return error - 4294967296.0 * np.floor((error + 2147483648.0) / 4294967296.0)
 
 
 @inlined
 def within_a_turn(angle):
-    """Return an angle [rad] as the one of -pi...pi that points the same way."""
+    """Return an angle [rad] wrapped to -pi...pi."""
     return angle - 2.0 * np.pi * np.floor((angle + np.pi) / (2.0 * np.pi))
 
 
 @inlined
 def torque(lags, fourth, position):
-    """Return the signal of the torque: the torque actual value, or the demand less the position [inc]."""
+    """Return the signal of the torque: torque actual value, or demand minus position [inc]."""
     return position_error(fourth, position, 0.0) if lags == 1 else float(fourth)
 
 
 @stage
 def describe(own, k):
-    """Write the observation of environment k, from the samples that have come by now."""
+    """Write the observation of environment k, from the samples received so far."""
     reference, held, scales, origin = own.reference, own.observations.held, own.scales, own.origin
     angles, observation, last = own.angles, own.observation, own.last
     lane = own.lanes[k]
@@ -186,7 +186,7 @@ def describe_lanes(address, where):
 
 @cached(allocates=False)
 def observe(address, first, count):
-    """Take some axes' samples in; write observations, rewards and their terms, and which environments have ended."""
+    """Process some axes' samples; write observations, rewards and their terms, and which environments have ended."""
     own = episodes_at(address)
     lanes, sampled, reference, observations = own.lanes, own.sampled, own.reference, own.observations
     scales, origin, last, angles, weights = own.scales, own.origin, own.last, own.angles, own.weights

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from mechanics.arrays import Floats
 
-# Generator, number of samples, their period [s] -> what `draw` returns.
+# Generator, number of samples, their period [s] -> the result of `draw`.
 Trajectory = Callable[[np.random.Generator, int, float], ArrayLike]
 
 TRAJECTORIES = ("hold", "moves", "sines", "run")
@@ -28,16 +28,16 @@ def draw(
 
     Args:
         kind: "hold" stays; "moves" goes to random places and rests there; "sines" adds three sines; "run" goes on at
-            the speed from the first moment, faster than a load can follow. A function returns all of it as it likes,
-            of generator, length and period.
-        rng: Where chance comes from.
-        length: Samples.
-        period: Of the samples [s].
+            the speed from the first moment, faster than a load can follow. A function of generator, length and period
+            returns any trajectory.
+        rng: Random generator.
+        length: Number of samples.
+        period: Their period [s].
         amplitude: Largest position [rev].
         speed: Largest velocity [rev/s].
 
     Raises:
-        ValueError: For what a function returns that has another shape, or is not finite.
+        ValueError: For a function's result of another shape, or not finite.
     """
     if callable(kind):
         return checked(kind(rng, length, period), (3, length))
@@ -52,7 +52,7 @@ def draw(
 
 
 def checked(rows: ArrayLike, *shapes: tuple[int, ...]) -> Floats:
-    """Return a user's position, velocity and acceleration; ValueError if shape or values are wrong."""
+    """Return a user's position, velocity and acceleration; ValueError if shape or values are invalid."""
     found = np.asarray(rows, float)
     if found.shape not in shapes or not np.isfinite(found).all():
         what = "numbers that are not finite" if found.shape in shapes else f"shape {found.shape}"

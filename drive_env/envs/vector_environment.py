@@ -1,7 +1,7 @@
 """Base of all environments: many episodes at the same time over one set of drives, and a single one as an Env.
 
-An environment is a machine with its drives and its episode. An environment's episode follows from its seed and its
-actions alone, so that it is the same among 1, 8 or 64 environments and under any number of threads.
+An environment is a machine with its drives and its episode. The episode follows only from its seed and its actions, so
+that it is the same among 1, 8 or 64 environments and with any number of threads.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 Info = dict[str, Any]
 Observation = Any  # an array with environments first, or a dict of such arrays
 Stepped = tuple[Observation, Floats, Mask, Mask, Info]
-# Observations that come of a step, its actions, and its info, of all environments -> rewards, shape (num_envs,).
+# Observations after a step, its actions, and its info, for all environments -> rewards, shape (num_envs,).
 Reward = Callable[[Observation, Any, Info], ArrayLike]
 
 RENDER_MODES = ("rgb_array", "human")
@@ -42,8 +42,8 @@ RENDER_MODES = ("rgb_array", "human")
 class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
     """Base of the vector environments; `config` is a subclass's configuration.
 
-    A subclass gives `_reset_environments` and `_step_environments`. Arrays that it returns are handed out as they are:
-    it must make new ones in each step.
+    A subclass implements `_reset_environments` and `_step_environments`. Their arrays are handed to callers without a
+    copy: they must be new in each step.
 
     In next-step mode the reset of an ended environment takes place after the others' step, so that an episode is the
     same in every mode; the environment's action of that step is ignored, its reward is 0.
@@ -68,7 +68,7 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
     STATE: tuple[str, ...] = ("_ended", "_some_ended", "_has_begun", "_stage", "_np_random_seed")
     config: Any
     drives: Any
-    _owned = False  # whether the drives are its own
+    _owned = False  # whether the drives were made by it
     _pictures: Pictures | None = None
 
     def __init__(
@@ -104,11 +104,10 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
 
     # --- what a subclass gives ------------------------------------------------------------------------------------
     def _reset_environments(self, mask: Mask, options: Mapping[str, Any]) -> tuple[Observation, Info]:
-        """Begin an episode in the environments where the mask is true, drawing from `rngs` of these environments alone.
+        """Begin an episode in the environments where the mask is true, drawing only from `rngs` of these environments.
 
         Returns:
-            Observations of all environments, of which only the masked are used; and arrays with what is to be told of
-            them.
+            Observations of all environments, of which only the masked are used; and arrays for their info.
         """
         raise NotImplementedError
 
@@ -145,7 +144,6 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
 
     # --- what it may replace --------------------------------------------------------------------------------------
     def _new_drives(self, num_envs: int) -> Any:
-        """Return the machines of the configuration, of all environments."""
         from drive_env.emulator.emulated_drives import EmulatedDrives
 
         c = self.config
@@ -156,7 +154,6 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
         return None if self._pictures is None else self._pictures.draw(lane)
 
     def _close_environments(self) -> None:
-        """Release drives and pictures."""
         if self._pictures is not None:
             self._pictures.close()
         if self._owned:
@@ -185,13 +182,13 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
 
     # --- states ---------------------------------------------------------------------------------------------------
     def save_state(self) -> State:
-        """Return all that the environments go on from, as plain data that pickles: continued from it, they do the same.
+        """Return the complete state as plain data that can be pickled: continued from it, environments do the same.
 
-        It holds drives, machines, trajectories, delays, random generators and how far each episode is; functions that
-        were given (reward, trajectory) are not in it.
+        It has drives, machines, trajectories, delays, random generators and the progress of each episode, but not the
+        user's functions (reward, trajectory).
 
         Raises:
-            ValueError: On a bus: real drives cannot be put back.
+            ValueError: On a bus: real drives cannot be restored.
         """
         return {
             "of": self._description(),
@@ -200,7 +197,7 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
         } | super().save_state()
 
     def restore_state(self, state: State) -> None:
-        """Put the environments back to a state that these have saved, or others of the same configuration.
+        """Restore a state saved by these environments, or by others of the same configuration.
 
         Raises:
             ValueError: For a state of another configuration, naming what differs; on a bus.
@@ -240,12 +237,13 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
     # --- gymnasium.vector.VectorEnv -------------------------------------------------------------------------------
     @property
     def spec(self) -> EnvSpec | None:  # type: ignore[override]
-        """The spec that it was made by, with the configured steps of an episode; None if not by Gymnasium."""
+        """Its spec, with the configured steps of an episode; None if it was not made by Gymnasium."""
         return self._spec
 
     @spec.setter
     def spec(self, spec: EnvSpec | None) -> None:
-        # Gymnasium wraps what is registered with a number of steps into a limit of its own, whatever the duration is.
+        # Gymnasium would wrap an environment registered with a number of steps into its own limit, whatever the
+        # duration.
         self._spec = copy.copy(spec)
         if self._spec is not None and self._spec.max_episode_steps is None:
             self._spec.max_episode_steps = self.max_episode_steps
@@ -256,17 +254,16 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
         """Begin an episode in every environment, or in those of `options["reset_mask"]`.
 
         Args:
-            seed: Of all; each environment has a generator of its own from it, number k that of
-                `SeedSequence(seed, spawn_key=(k,))`, so that neighbouring seeds have none in common. Environment 0 is
-                the single environment of that seed. Or a seed for each, of single environments. None goes on with
-                each environment's generator.
-            options: "reset_mask", shape (num_envs,), bool. "state": go on from one that `save_state` returned, instead
-                of beginning; nothing else is given then. "machine": true parameters for these episodes, by name, one
-                value or one for each environment, in place of those that would be drawn; not on a bus. Others are the
-                environment's.
+            seed: Seed of all; environment k has the generator of `SeedSequence(seed, spawn_key=(k,))`, so that
+                neighbouring seeds share no generator. Environment 0 is the single environment of that seed. Or one seed
+                per environment, as of single environments. None: each environment's generator continues.
+            options: "reset_mask", shape (num_envs,), bool. "state": continue from a result of `save_state` instead of
+                beginning; no other argument is allowed then. "machine": true parameters for these episodes, by name,
+                one value or one for each environment, instead of drawn ones; not on a bus. Other options depend on the
+                environment.
 
         Raises:
-            ValueError: For an unknown option, naming those that there are, or a value out of its range.
+            ValueError: For an unknown option, naming the known ones, or a value out of its range.
         """
         options = dict(options or {})
         for name in options:
@@ -295,8 +292,8 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
         Raises:
             gymnasium.error.ResetNeeded: Before the first reset, or, with autoreset disabled, while an environment has
                 ended.
-            ValueError: For an action that is no finite number, before anything is sent to a drive; that of an
-                environment that has ended is ignored.
+            ValueError: For an action that is not finite, before anything is sent to a drive; actions of ended
+                environments are ignored.
         """
         if not self._has_begun:
             raise gymnasium.error.ResetNeeded("call reset() before the first step()")
@@ -362,7 +359,7 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
         return chosen
 
     def _seeds(self, seed: int | Sequence[int | None] | None) -> list[tuple[int | None, int]]:
-        """Return of each environment its seed, and its place among those of that seed."""
+        """Return each environment's seed, and its number among those of that seed."""
         if seed is None or isinstance(seed, (int, np.integer)):
             return [(seed, lane) for lane in range(self.num_envs)]
         if len(seed) != self.num_envs:
@@ -373,7 +370,7 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
 
 
 def _generator(seed: int, place: int) -> np.random.Generator:
-    """Return the generator of an environment: of the first among those of a seed Gymnasium's own of that seed."""
+    """Return the generator of an environment; for the first one of a seed it is Gymnasium's own for that seed."""
     first: np.random.Generator = seeding.np_random(seed)[0]
     if place == 0:
         return first
@@ -398,7 +395,7 @@ class SingleEnvironment(gymnasium.Env[Any, Any]):
 
     @property
     def spec(self) -> EnvSpec | None:  # type: ignore[override]
-        """As of the vectorised environment."""
+        """The vectorised environment's spec."""
         return self.vector.spec
 
     @spec.setter
@@ -420,7 +417,7 @@ class SingleEnvironment(gymnasium.Env[Any, Any]):
             raise gymnasium.error.ResetNeeded("the episode has ended or none has begun; call reset()")
         if not _are_finite(action):
             _finite_actions(_batch_of_one(action), np.zeros(1, bool))
-        # A user's reward is of all environments' arrays; without one there is a way with less overhead.
+        # A user's reward needs all environments' arrays; without one there is a faster way.
         stepped = (
             vector._step_alone(action)
             if vector.reward_function is None
@@ -436,12 +433,12 @@ class SingleEnvironment(gymnasium.Env[Any, Any]):
         return self.vector.render_environment(0)
 
     def save_state(self) -> State:
-        """Return all that the environment goes on from, as `VectorEnvironment.save_state` does."""
+        """Return the complete state of the environment, as `VectorEnvironment.save_state`."""
         rng = self._np_random
         return self.vector.save_state() | {"np_random": None if rng is None else rng.bit_generator.state}
 
     def restore_state(self, state: State) -> None:
-        """Put the environment back to a state that it has saved, or another of the same configuration.
+        """Restore a state saved by this environment, or by another one of the same configuration.
 
         Raises:
             ValueError: As `VectorEnvironment.restore_state`.
@@ -473,9 +470,9 @@ def merge(chosen: Observation, others: Observation, mask: Mask) -> Observation:
 
 
 def merge_info(chosen: Info, others: Info, mask: Mask) -> Info:
-    """Return merged infos: `chosen` where the mask is true; an entry of one side alone keeps its values.
+    """Return merged infos: `chosen` where the mask is true; an entry of only one side keeps its values.
 
-    Such an entry comes with a mask, its name behind an underscore, as Gymnasium has it.
+    As in Gymnasium, such an entry has a mask, named with a leading underscore.
     """
     merged: Info = {}
     for key in [*others, *(key for key in chosen if key not in others)]:
@@ -507,7 +504,6 @@ def one_of(tree: Any) -> Any:
 
 
 def _restored(kind: Any, num_envs: int, how: dict[str, Any], state: State, spec: EnvSpec | None) -> VectorEnvironment:
-    """Return environments made anew, in a state."""
     made: VectorEnvironment = kind(num_envs, **how)
     made.restore_state(state)
     made.spec = spec
@@ -515,7 +511,7 @@ def _restored(kind: Any, num_envs: int, how: dict[str, Any], state: State, spec:
 
 
 def _text(value: Any) -> str:
-    """Return a field of a configuration as text that is the same for the same value."""
+    """Return a field of a configuration as text; equal values give equal texts."""
     if isinstance(value, Distributions):
         return value.to_toml()
     return f"{value.__module__}.{value.__qualname__}" if inspect.isroutine(value) else repr(value)
@@ -544,9 +540,9 @@ def _rows(tree: Observation, mask: Mask) -> Texts:
 
 
 def _are_finite(actions: Any) -> bool:
-    """Return whether all are finite numbers; also False for some whose sum is beyond all numbers.
+    """Return whether all are finite numbers; also False if their sum overflows.
 
-    A sum in Python takes half of the time that NumPy takes to look at each.
+    A sum in Python takes half the time of NumPy's check of each number.
     """
     return math.isfinite(sum(np.asarray(actions).ravel().tolist()))
 
@@ -555,7 +551,7 @@ def _finite_actions(actions: Any, ignored: Mask) -> NDArray[Any]:
     """Return actions with 0 for those that are not a number, in environments whose action is ignored.
 
     Raises:
-        ValueError: For what is no number elsewhere: a drive would be told whatever its integer happens to be.
+        ValueError: For a NaN elsewhere, whose conversion to an integer is arbitrary.
     """
     values = np.array(actions, float)
     rows = values.reshape(len(ignored), -1)

@@ -1,1 +1,1 @@
-"""EtherCAT: the slave controller in software, its mailbox, its clocks, and the ways frames come to it."""
+"""EtherCAT: the slave controller in software, its mailbox, its clocks, and the transports of frames to it."""

@@ -1,10 +1,10 @@
 """The calls between an EtherCAT slave controller and the device behind it.
 
-The controller (`controller.py`) owns whatever ETG.1000.4 and ETG.1000.6 put before the application: registers, EEPROM
-interface, FMMUs, sync managers, the mailbox header with its counter and its repetitions, FoE in Bootstrap, the AL state
-machine with the checks of sync managers 0 to 3, watchdogs and clocks. The application owns the object dictionary: CoE
-messages without their mailbox header, the process image as bytes, the SII's content, and its own reasons to refuse a
-state.
+The controller (`controller.py`) owns everything that ETG.1000.4 and ETG.1000.6 put in front of the application:
+registers, EEPROM interface, FMMUs, sync managers, the mailbox header with its counter and its repetitions, FoE in
+Bootstrap, the AL state machine with the checks of sync managers 0 to 3, watchdogs and clocks. The application owns the
+object dictionary: CoE messages without their mailbox header, the process image as bytes, the SII's content, and its own
+reasons to refuse a state.
 
 The order of calls, all in one thread, each with the time `now` [s] of the emulated world:
 
@@ -41,7 +41,7 @@ class AlState(IntEnum):
 
 
 class AlStatusCode(IntEnum):
-    """AL status codes (0134h; ETG.1000.6, table 11; ETG.1020): why a state was refused or left."""
+    """AL status codes (0134h; ETG.1000.6, table 11; ETG.1020): the reason why a state was refused or left."""
 
     NO_ERROR = 0x0000
     UNSPECIFIED = 0x0001
@@ -89,23 +89,23 @@ class SyncManagerSetting:
 
     @property
     def is_mailbox(self) -> bool:
-        """Whether it has one buffer with handshake; otherwise it has three."""
+        """Whether it is a mailbox (one buffer with handshake); otherwise it has three buffers."""
         return self.control & 0x03 == 0x02
 
     @property
     def is_written_by_master(self) -> bool:
-        """Direction."""
+        """Whether the master writes and the device reads."""
         return self.control & 0x0C == 0x04
 
     @property
     def has_watchdog(self) -> bool:
-        """Whether the process-data watchdog watches it."""
+        """Whether the process-data watchdog monitors it."""
         return bool(self.control & 0x40)
 
 
 @dataclass(frozen=True, slots=True)
 class ClockSetting:
-    """Distributed clocks as the master has set them: SYNC0 is made, its cycle [s] (0: one shot); SYNC1 likewise."""
+    """Distributed clocks as the master has set them: is SYNC0 on, its cycle [s] (0: one shot); SYNC1 likewise."""
 
     has_sync0: bool
     sync0_cycle: float
@@ -123,9 +123,9 @@ class MailboxPlace:
 
 @dataclass(frozen=True, slots=True)
 class SlaveLayout:
-    """Where a device has its sync managers; its SII says the same to the master (words 0014h to 001Bh, category 41).
+    """Addresses of a device's sync managers; its SII gives the same to the master (words 0014h to 001Bh, category 41).
 
-    `receive` is what the master writes (sync manager 0), `send` what it reads (1). A device without
+    `receive` is the mailbox that the master writes (sync manager 0), `send` the one that it reads (1). A device without
     `bootstrap_receive` has no Bootstrap. `outputs` and `inputs` are the addresses of sync managers 2 and 3.
     """
 
@@ -141,28 +141,28 @@ class Application(Protocol):
     """The device behind a slave controller; the module's docstring has the order of calls.
 
     Attributes:
-        layout: Where its sync managers lie.
+        layout: Addresses of its sync managers.
     """
 
     layout: SlaveLayout
 
     @property
     def identification(self) -> int:
-        """Number that answers an identification request (AL control bit 5); 0: the device has none."""
+        """Number that answers an identification request (AL control bit 5); 0 if the device has no such number."""
 
     @property
     def output_size(self) -> int:
-        """Bytes that the master writes by sync manager 2, as they are mapped now; 0: none."""
+        """Bytes that the master writes by sync manager 2 with the present mapping; 0: none."""
 
     @property
     def input_size(self) -> int:
-        """Bytes that the master reads by sync manager 3, as they are mapped now; 0: none."""
+        """Bytes that the master reads by sync manager 3 with the present mapping; 0: none."""
 
     def read_sii(self) -> bytes:
-        """Return the EEPROM's content (ETG.2010); its length is a multiple of 128 bytes. Words 0000h to 0007h count."""
+        """Return the EEPROM's content (ETG.2010), a multiple of 128 bytes including words 0000h to 0007h."""
 
     def write_sii(self, content: bytes) -> None:
-        """Keep the EEPROM's content after the master has written to it; whole, of the length that `read_sii` gave."""
+        """Store the EEPROM's whole content after the master has written to it; its length is that of `read_sii`."""
 
     def power_on(self, now: float) -> None:
         """Boot: stored values, no process data, Init."""
@@ -170,23 +170,24 @@ class Application(Protocol):
     def request_state(
         self, old: AlState, new: AlState, sync_managers: Sequence[SyncManagerSetting], clock: ClockSetting, now: float
     ) -> AlStatusCode:
-        """Return NO_ERROR to let the state change, or why it must not.
+        """Return NO_ERROR to allow the change of state, otherwise the reason against it.
 
-        The controller has checked place, length, direction and activation of sync managers 0 to 3 before.
+        The controller has already checked address, length, direction and activation of sync managers 0 to 3.
         """
 
     def state_changed(self, new: AlState, code: AlStatusCode, now: float) -> None:
-        """Learn the new state, and the code with which an error forced it; leaving Op takes the drive out of motion."""
+        """Note the new state, and the code of the error that forced it; leaving Op stops the drive."""
 
     def coe(self, message: bytes, now: float) -> list[bytes]:
         """Return the CoE messages that answer one, each with its CoE header and without a mailbox header.
 
         Raises:
-            ValueError: For a message that is too short or of no service; the controller answers by a mailbox error.
+            ValueError: For a message that is too short or of an unknown service; the controller answers by a mailbox
+                error.
         """
 
     def pending_coe(self, now: float) -> list[bytes]:
-        """Return and forget the CoE messages that nothing asked for now: emergencies, answers that took time."""
+        """Return and forget the CoE messages that do not answer a present request: emergencies, delayed answers."""
 
     def before_cycle(self, now: float) -> None:
         """Run everything due before the drives advance by one communication cycle."""
@@ -195,16 +196,16 @@ class Application(Protocol):
         """Run everything due after it."""
 
     def outputs(self, data: bytes, now: float) -> None:
-        """Take the output image, `output_size` bytes, which take effect with the cycle that begins next."""
+        """Receive the output image, `output_size` bytes, which takes effect with the next cycle."""
 
     def inputs(self, now: float) -> bytes:
         """Return the input image, `input_size` bytes."""
 
     def watchdog_expired(self, now: float) -> None:
-        """Learn that no outputs came in time: the drive stops by its fault reaction."""
+        """Note that no outputs came in time: the drive stops by its fault reaction."""
 
     def sync0(self, now: float) -> None:
-        """Learn that a SYNC0 pulse came."""
+        """Handle a pulse of SYNC0."""
 
     def sync1(self, now: float) -> None:
-        """Learn that a SYNC1 pulse came."""
+        """Handle a pulse of SYNC1."""

@@ -16,11 +16,11 @@ LONGEST_WAIT = 0.05  # s until a request to stop is seen
 
 
 class BesideCan:
-    """Answers an EtherCAT master in a thread of its own, while a CAN server lets time pass for both.
+    """Answers an EtherCAT master in a separate thread, while a CAN server lets time pass for both.
 
     Attributes:
         world: The slaves, `beside` the world that the server serves.
-        way: Where their master is.
+        way: Connects their master.
         answer_times: How long frames waited for their answer [s].
     """
 
@@ -34,12 +34,12 @@ class BesideCan:
         self._thread = threading.Thread(target=self._run, name="EtherCAT beside CAN", daemon=True)
 
     def start(self) -> None:
-        """Switch the slaves on and answer their master; the CAN server is started after that."""
+        """Switch the slaves on and begin to answer their master; the CAN server is started after that."""
         self.world.power_on()
         self._thread.start()
 
     def close(self) -> None:
-        """Stop, and close the way."""
+        """Stop, and close the connection."""
         self._stop.set()
         if self._thread.is_alive():
             self._thread.join()

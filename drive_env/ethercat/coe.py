@@ -60,14 +60,14 @@ class MailboxEmergencies:
         self._room = QUEUE * num_axes
 
     def push(self, emergency: EmergencyCode, error_register: int) -> None:
-        """Queue one; a full queue loses the newest."""
+        """Queue an emergency; a full queue loses the newest."""
         if len(self._waiting) < self._room:
             content = emergency.code.to_bytes(2, "little") + bytes((error_register,)) + bytes(emergency.extra)
             self._waiting.append(message(CoeService.EMERGENCY, content))
             self.told = error_register
 
     def take(self) -> list[bytes]:
-        """Return and forget the messages that wait."""
+        """Return and forget the waiting messages."""
         taken = list(self._waiting)
         self._waiting.clear()
         return taken

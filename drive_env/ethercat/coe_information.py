@@ -43,7 +43,7 @@ class SdoInformation:
         }
 
     def request(self, data: bytes) -> list[bytes]:
-        """Return the messages that answer a request; ValueError for one that is too short or incomplete."""
+        """Return the answers to a request; ValueError for one that is too short or incomplete."""
         if len(data) < HEAD or data[0] & INCOMPLETE:
             raise ValueError("SDO information is asked for in one message of four bytes or more")
         operation, content = data[0], data[HEAD:]
@@ -76,7 +76,7 @@ class SdoInformation:
         return self._fragments(LIST, struct.pack(f"<{len(words) + 1}H", kind, *words))
 
     def _fragments(self, operation: int, content: bytes) -> list[bytes]:
-        """Return a response in as many messages as it takes, each of whole words."""
+        """Return a response in as many messages as needed, each of whole words."""
         size = self._room // 2 * 2
         parts = [content[k : k + size] for k in range(0, len(content), size)]
         messages = []

@@ -1,7 +1,7 @@
 """A drive on EtherCAT: the device behind the slave controller (`application.py` has the calls and their order).
 
-Dictionary, axes, errors, stored parameters and the process image are those of any node (`node/`). Here stands what
-EtherCAT makes of them: which AL state lets what act, and when outputs take effect.
+Dictionary, axes, errors, stored parameters and the process image are those of any node (`node/`). This module adds
+EtherCAT's part: what acts in which AL state, and when outputs take effect.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from drive_env.node.store import PowerLostError, Store
 
 ENABLE_OPERATION = 0x0F  # bits of the controlword that command operation enabled
 OUTPUTS_CONDITION = "outputs"
-NODE_ID = 1  # of the factory's values; EtherCAT has no COB-IDs that follow it
+NODE_ID = 1  # of the factory's values; on EtherCAT no COB-ID depends on it
 
 
 class CoeObjects(NodeObjects):
@@ -50,27 +50,27 @@ class CoeObjects(NodeObjects):
     synchronisation: Synchronisation
 
     def port(self, entry: Entry) -> ObjectPort:
-        """Return the way to one of these objects."""
+        """Return the port of one of these objects."""
         if self.synchronisation.owns(entry):
             return self.synchronisation.port(entry)
         return self.image.port(entry) if self.image.owns(entry) else super().port(entry)
 
 
 class CoeNode:
-    """The device of a slave, in front of the axes of an emulated one.
+    """The device of a slave, connected to emulated axes.
 
     Args:
         drives: The emulated drives.
         first_axis: Number of the device's first axis among the drives'.
-        spare: Drives of the node's last axes, those that `drives` have none for.
-        store: The file that is its non-volatile memory; without one it lasts as long as the node.
-        serial: Serial number in its EEPROM, and in 1018h:04 of a device that has it.
+        spare: Drives of the node's last axes if `drives` have too few.
+        store: File of its non-volatile memory; None: memory that lasts as long as the node.
+        serial: Serial number in its EEPROM, and in 1018h:04 if the device has it.
 
     Raises:
-        ValueError: For a device that has no EtherCAT, or axes that the drives do not have.
+        ValueError: For a device without EtherCAT, or axes that the drives do not have.
 
     Attributes:
-        layout: Where its sync managers lie.
+        layout: Addresses of its sync managers.
         drives: The emulated drives.
         dictionary: All objects by index and sub-index.
         state: AL state.
@@ -123,28 +123,28 @@ class CoeNode:
         self._information = SdoInformation(describe(device), behaviour.send.length)
         self._sii, self._serial = sii_content(device, serial), serial
         self._waiting: bytes | None = None  # outputs that take effect with the next pulse
-        self._number = device.canopen.objects.get("node_id")  # object of the node's number
+        self._number = device.canopen.objects.get("node_id")  # object with the node's number
         # Objects of measured times: register of the device, and when the last event was [s].
         self._times: dict[Role, tuple[ObjectPort, float]] = {}
 
     @property
     def identification(self) -> int:
-        """Number of the node, of a device that keeps it in a register of its own; else 0."""
+        """Number of the node, if the device keeps it in a register; else 0."""
         return self._objects.value(*self._number) if self._number else 0
 
     # --- process data -------------------------------------------------------------------------------------------------
     @property
     def output_size(self) -> int:
-        """Bytes of sync manager 2, as they are mapped now."""
+        """Bytes of sync manager 2 with the present mapping."""
         return self._image.output_size
 
     @property
     def input_size(self) -> int:
-        """Bytes of sync manager 3, as they are mapped now."""
+        """Bytes of sync manager 3 with the present mapping."""
         return self._image.input_size
 
     def outputs(self, data: bytes, now: float) -> None:
-        """Let outputs take effect at once or, with SYNC0 or SYNC1, at its next pulse."""
+        """Apply outputs at once or, with SYNC0 or SYNC1, at its next pulse."""
         self._synchronisation.outputs_came(now)
         self._measure(Role.PACKET_TIME, now)
         if self._synchronisation.has_sync0:
@@ -153,21 +153,21 @@ class CoeNode:
             self._apply(data, now)
 
     def inputs(self, now: float) -> bytes:
-        """Return the input image as it is now."""
+        """Return the present input image."""
         return self._image.read_inputs()
 
     def sync0(self, now: float) -> None:
-        """Take a pulse of SYNC0, unless SYNC1 is what counts."""
+        """Handle a pulse of SYNC0, unless SYNC1 is used."""
         if not self._synchronisation.has_sync1:
             self._pulse(now)
 
     def sync1(self, now: float) -> None:
-        """Take a pulse of SYNC1, if it is what counts."""
+        """Handle a pulse of SYNC1, if it is used."""
         if self._synchronisation.has_sync1:
             self._pulse(now)
 
     def _pulse(self, now: float) -> None:
-        """Let the outputs that came since the last pulse take effect."""
+        """Apply the outputs received since the last pulse."""
         self._measure(Role.SYNC_TIME, now)
         data, self._waiting = self._waiting, None
         if self.state is AlState.OP:
@@ -183,7 +183,7 @@ class CoeNode:
 
     # --- states -------------------------------------------------------------------------------------------------------
     def power_on(self, now: float) -> None:
-        """Boot: stored values, the factory's image, no error to be told."""
+        """Boot: stored values, the factory's image, no waiting emergencies."""
         self.state = AlState.INIT
         self._waiting = None
         self._synchronisation.restart()
@@ -201,7 +201,7 @@ class CoeNode:
     def request_state(
         self, old: AlState, new: AlState, sync_managers: Sequence[SyncManagerSetting], clock: ClockSetting, now: float
     ) -> AlStatusCode:
-        """Refuse clocks that the device cannot be synchronised by."""
+        """Refuse clocks that the device cannot synchronise to."""
         if new is AlState.SAFE_OP and old is AlState.PRE_OP:
             self._take_cycle()
             self._times.clear()
@@ -211,7 +211,7 @@ class CoeNode:
         return AlStatusCode.NO_ERROR
 
     def state_changed(self, new: AlState, code: AlStatusCode, now: float) -> None:
-        """Learn the new state; who leaves Op, for whatever reason, has its motors stopped by their fault reaction."""
+        """Note the new state; leaving Op, for whatever reason, stops the motors by their fault reaction."""
         old, self.state = self.state, new
         if old is AlState.OP and new is not AlState.OP:
             self._waiting = None
@@ -223,17 +223,17 @@ class CoeNode:
             self._emergencies.clear()
 
     def watchdog_expired(self, now: float) -> None:
-        """Learn that no outputs came in time: the axes stop by their fault reaction."""
+        """Note that no outputs came in time: the axes stop by their fault reaction."""
         self._waiting = None
         self._stop_axes(now)
 
     def _stop_axes(self, now: float) -> None:
-        """Take enabled axes into their fault reaction, and tell of it."""
+        """Take enabled axes into their fault reaction, and report it."""
         if self._axes.trip():
             self._errors.condition("communication_error", now)
 
     def before_cycle(self, now: float) -> None:
-        """Keep motors off outside Op (manual of the TMCM-3313, section 2.2): whatever enabled one, it goes no cycle."""
+        """Switch motors off before a cycle outside Op, however enabled (manual of the TMCM-3313, section 2.2)."""
         if self.state is not AlState.OP and any(axis.state == State.OPERATION_ENABLED for axis in self._axes):
             self._stop_axes(now)
 
@@ -243,7 +243,7 @@ class CoeNode:
 
     # --- mailbox ------------------------------------------------------------------------------------------------------
     def coe(self, message: bytes, now: float) -> list[bytes]:
-        """Return the CoE messages that answer one; ValueError for none that is answered."""
+        """Return the answers to a CoE message; ValueError for a message that is not answered."""
         service, content = split(message)
         if service == CoeService.SDO_REQUEST:
             try:
@@ -256,7 +256,7 @@ class CoeNode:
         raise ValueError(f"service {service} of CoE is not one of this device")
 
     def pending_coe(self, now: float) -> list[bytes]:
-        """Return and forget the emergencies that wait."""
+        """Return and forget the waiting emergencies."""
         return self._emergencies.take()
 
     def _is_pre_op(self) -> bool:
@@ -267,7 +267,7 @@ class CoeNode:
         return entries if entries is not None else [self.dictionary.entries.find((index, 0))]
 
     def _port(self, index: int, sub: int) -> ObjectPort:
-        """Return the way by which an SDO comes to an object."""
+        """Return the port by which SDOs access an object."""
         port = self.dictionary.port(index, sub)
         if port.event != "controlword":
             return port
@@ -282,7 +282,7 @@ class CoeNode:
 
     # --- EEPROM -------------------------------------------------------------------------------------------------------
     def read_sii(self) -> bytes:
-        """Return the EEPROM's content; a device whose number is the alias has it in its words."""
+        """Return the EEPROM's content, with the alias in it if the device uses that as its number."""
         if self._number is None:
             return self._sii
         words = configuration(self._stored_number())
@@ -294,7 +294,7 @@ class CoeNode:
         return int(self._store.sections.get("bus", {}).get(self._number, factory))
 
     def _measure(self, role: Role, now: float) -> None:
-        """Write the time since the last event [us], of a device that has a register for it."""
+        """Write the time since the last event [us], if the device has a register for it."""
         key = self._device.roles.get(role)
         if key is None:
             return
@@ -303,7 +303,7 @@ class CoeNode:
         self._times[role] = (port, now)
 
     def _take_cycle(self) -> None:
-        """Let the drives' cycle be the one that a register of the device has, if it has one."""
+        """Set the drives' cycle to that in the device's register, if it has one."""
         key = self._device.roles.get(Role.SET_CYCLE)
         if key is not None:
             for drives in self._all_drives:

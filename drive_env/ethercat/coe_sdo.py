@@ -1,7 +1,7 @@
 """The SDO server of CoE: expedited, normal, segmented transfers; single entries, whole objects (ETG.1000.6, 5.6.2).
 
-It differs from CANopen's (`node/sdo_server.py`) in that a message has room for all data that fit the mailbox, not for 4
-or 7 bytes, and in complete access: sub-index 0 as 16 bits, and the others behind it.
+Differences from CANopen's (`node/sdo_server.py`): a message holds all data that fit into the mailbox, not 4 or 7 bytes,
+and there is complete access: sub-index 0 as 16 bits, followed by the others.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ from drive_env.node.sdo_server import check_length, encode, size_of, take
 
 @dataclass(slots=True)
 class CoeTransfer:
-    """A segmented transfer that is open; `multiplexor` is index and sub-index as in the messages."""
+    """An open segmented transfer; `multiplexor` is index and sub-index as in the messages."""
 
     multiplexor: bytes
     data: bytearray
@@ -66,7 +66,7 @@ class CoeSdoServer:
     Args:
         port: Finds an object by index and sub-index; raises ObjectAccessError.
         entries: Returns the entries of an object in the order of their sub-indices.
-        image: Objects of which the number of entries can be written.
+        image: Objects whose number of entries can be written.
         room: Length of the send mailbox [bytes].
     """
 
@@ -88,7 +88,7 @@ class CoeSdoServer:
         self._open = None
 
     def request(self, data: bytes) -> list[bytes]:
-        """Return the messages that answer a request, without its CoE header; ValueError for one that is too short."""
+        """Return the answers to a request without its CoE header; ValueError for one that is too short."""
         if not data:
             raise ValueError("an SDO request has a first byte")
         specifier = data[0] >> 5
@@ -172,7 +172,7 @@ class CoeSdoServer:
         transfer = self._transfer(data, is_upload=False)
         assert transfer.finish is not None, "it is a download"
         content = data[1:]
-        if len(content) <= LEAST:  # the number of bytes that are not in use counts in the shortest segment alone
+        if len(content) <= LEAST:  # only the shortest segment has a count of unused bytes
             content = content[: LEAST - (data[0] >> 1 & 0x07)]
         transfer.data += content
         if len(transfer.data) > transfer.expected:
@@ -208,11 +208,11 @@ class CoeSdoServer:
         return finish
 
     def _expedited_size(self, index: int, sub: int, first: int) -> int:
-        """Return how many of the four bytes count where the request does not say."""
+        """Return how many of the four bytes are data if the request does not give it."""
         return 4 if first & COMPLETE else size_of(self._port(index, sub).entry) or 4
 
     def _check_room(self, index: int, sub: int, size: int, *, is_whole: bool) -> None:
-        """Raise before the data come where so many cannot be taken."""
+        """Raise before the data come if the object cannot hold them."""
         if is_whole:
             most = sum(max(2 if one.sub == 0 else 0, size_of(one)) for one in self._entries(index))
             if size > most:
@@ -222,7 +222,7 @@ class CoeSdoServer:
 
     # --- whole objects ------------------------------------------------------------------------------------------------
     def _members(self, index: int, first: int) -> list[Entry]:
-        """Return the entries that complete access to an object means, sub-index 0 among them."""
+        """Return the entries that complete access to an object covers, including sub-index 0."""
         entries = list(self._entries(index))
         if len(entries) == 1 or any(one.bits is None for one in entries):
             raise ObjectAccessError(UNSUPPORTED_ACCESS, f"{index:04X}h can only be accessed entry by entry")
@@ -269,7 +269,7 @@ class CoeSdoServer:
 
 
 def _parts(entries: Sequence[Entry], content: bytes) -> tuple[list[tuple[Entry, int]], bytes]:
-    """Return the values of entries from sub-index 1 on, as far as there are data, and the data left over."""
+    """Return the values of entries from sub-index 1 on, as far as there are data, and the remaining data."""
     rows = []
     for entry in entries[1:]:
         size = size_of(entry)

@@ -1,7 +1,7 @@
 """A slave controller: datagrams read and write its registers and its memory (ETG.1000.4; ET1100 data sheet).
 
-It knows bytes and addresses. What a state means, what a mailbox carries and what the process data do is the firmware's
-(`slave.py`), which looks after each frame at what has changed.
+It only handles bytes and addresses. States, mailbox and process data are handled by the firmware (`slave.py`), which
+checks after each frame what has changed.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ AUTO_INCREMENT = frozenset((C.APRD, C.APWR, C.APRW, C.ARMW))
 CONFIGURED = frozenset((C.FPRD, C.FPWR, C.FPRW, C.FRMW))
 BROADCAST = frozenset((C.BRD, C.BWR, C.BRW))
 LOGICAL = frozenset((C.LRD, C.LWR, C.LRW))
-MULTIPLE = frozenset((C.ARMW, C.FRMW))  # the addressed one is read, all others are written
+MULTIPLE = frozenset((C.ARMW, C.FRMW))  # the addressed slave is read, all others are written
 READING = frozenset((C.APRD, C.APRW, C.FPRD, C.FPRW, C.BRD, C.BRW, C.LRD, C.LRW))
 WRITING = frozenset((C.APWR, C.APRW, C.FPWR, C.FPRW, C.BWR, C.BRW, C.LWR, C.LRW))
 MASKS = registers.write_masks()
@@ -34,7 +34,7 @@ MICROSECOND = 1e-6
 ACTIVATE, REPEAT = 6, 0x02  # byte of a sync manager's registers, and its bit
 PDI_CONTROL, DEACTIVATED = 7, 0x01  # alike, the device's side
 UNUSED_PORTS = 0b01010000_00000000  # of 0110h: ports 2 and 3 are closed
-DL_EVENT, AL_EVENT = 0x04, 0x08  # of 0210h
+DL_EVENT, AL_EVENT = 0x04, 0x08  # events in 0210h
 WATCHDOG_IS_GOOD = 0x01
 
 
@@ -42,8 +42,8 @@ class SlaveController:
     """One controller; it is in reset until `power_on`.
 
     Args:
-        takes_time: The EEPROM takes its time.
-        drift: By how much its oscillator is too fast, as a share.
+        takes_time: Whether the EEPROM takes time.
+        drift: Share by which its oscillator is too fast.
         epoch: Local time [ns] of its clock at world time 0.
 
     Attributes:
@@ -51,10 +51,10 @@ class SlaveController:
         managers: The sync managers.
         clock: Distributed clocks.
         sii: The EEPROM interface.
-        al_control: What the master has written to 0120h since the firmware last looked; None: nothing.
-        settings_changed: A sync manager was switched on or off.
-        reset_requested: The master wrote the reset sequence.
-        ends_line: No slave comes behind it.
+        al_control: The master's last write to 0120h since the firmware last looked; None without one.
+        settings_changed: Whether a sync manager was switched on or off.
+        reset_requested: Whether the master wrote the reset sequence.
+        ends_line: Whether no slave follows.
     """
 
     def __init__(self, *, takes_time: bool = False, drift: float = 0.0, epoch: int = 0) -> None:
@@ -83,7 +83,7 @@ class SlaveController:
         self.connect(self.ends_line)
 
     def connect(self, ends_line: bool) -> None:
-        """Tell by 0110h whether a slave comes behind: port 0 has a link, port 1 then, too; others are closed."""
+        """Show in 0110h whether a slave follows: port 0 has a link, port 1 only then; others are closed."""
         self.ends_line = ends_line
         status = UNUSED_PORTS | 0x0001 | 0x0010 | 0x0200 | (0x0400 if ends_line else 0x0820)
         self.put_register(registers.DL_STATUS, status, 2)
@@ -95,11 +95,11 @@ class SlaveController:
         return int.from_bytes(self.memory[address : address + size], "little")
 
     def put_register(self, address: int, value: int, size: int) -> None:
-        """Write a register, whatever a master may."""
+        """Write a register, regardless of the master's write mask."""
         self.memory[address : address + size] = value.to_bytes(size, "little")
 
     def put_al_status(self, status: int, code: int) -> None:
-        """Show AL status and AL status code, with the event that belongs to it."""
+        """Set AL status and AL status code, and raise their event."""
         self.put_register(registers.AL_STATUS, status, 2)
         self.put_register(registers.AL_STATUS_CODE, code, 2)
         self._raise_event(AL_EVENT)
@@ -109,14 +109,14 @@ class SlaveController:
         self.memory[address] = min(self.memory[address] + 1, 255)
 
     def acknowledge_repeat(self, number: int) -> None:
-        """Answer the repeat request of a sync manager."""
+        """Acknowledge the repeat request of a sync manager."""
         base = registers.SYNC_MANAGERS + number * registers.SYNC_MANAGER_SIZE
         self.memory[base + PDI_CONTROL] = self.memory[base + PDI_CONTROL] & ~REPEAT | (
             REPEAT if self.managers[number].repeat_request else 0
         )
 
     def deactivate(self, number: int, is_locked: bool) -> None:
-        """Deactivate a sync manager, or activate it again, from the device's side (0807h); either empties it."""
+        """Deactivate or reactivate a sync manager from the device's side (0807h); both empty it."""
         manager = self.managers[number]
         if manager.is_locked != is_locked:
             manager.is_locked = is_locked
@@ -127,17 +127,17 @@ class SlaveController:
     # --- watchdog of process data -------------------------------------------------------------------------------------
     @property
     def watchdog_time(self) -> float:
-        """Time of the process-data watchdog [s]; 0: it is off. Divider and time count 40 ns and the divider's ticks."""
+        """Time of the process-data watchdog [s], 0: off. The divider counts 40 ns, the time the divider's ticks."""
         divider = self.register(registers.WATCHDOG_DIVIDER, 2) + 2
         return self.register(registers.SM_WATCHDOG, 2) * divider * 40e-9
 
     def trigger_watchdog(self, now: float) -> None:
-        """Let the watchdog begin again."""
+        """Restart the watchdog."""
         self._triggered = now
         self.memory[registers.WATCHDOG_STATUS] |= WATCHDOG_IS_GOOD
 
     def watchdog_deadline(self) -> float | None:
-        """Return when it expires [s]; None: it is off, or no sync manager is watched."""
+        """Return when it expires [s]; None if it is off, or no sync manager is monitored."""
         time = self.watchdog_time
         watched = any(
             m.end and not m.is_locked and m.setting.has_watchdog and m.setting.is_written_by_master
@@ -146,13 +146,13 @@ class SlaveController:
         return self._triggered + time if time > 0.0 and watched else None
 
     def expire_watchdog(self) -> None:
-        """Show that it has expired, and count it."""
+        """Show that it has expired, and increment its counter."""
         self.memory[registers.WATCHDOG_STATUS] &= ~WATCHDOG_IS_GOOD
         self.count(registers.WATCHDOG_COUNTER)
 
     # --- datagrams ----------------------------------------------------------------------------------------------------
     def process(self, frame: bytearray, places: list[DatagramPlace], now: int) -> None:
-        """Let a frame with these datagrams pass at world time `now` [ns]."""
+        """Process the datagrams of a frame at world time `now` [ns]."""
         memory = self.memory
         for command, at, length in places:
             if command in LOGICAL:
@@ -286,7 +286,7 @@ class SlaveController:
         return done
 
     def _peek(self, address: int, length: int) -> bytes:
-        """Return the bytes that the master wrote last, to write some of their bits anew."""
+        """Return the bytes that the master last wrote, so that some of their bits can be changed."""
         return bytes(self.memory[address : address + length]).ljust(length, b"\0")
 
     def _refresh(self, address: int, end: int, now: int) -> None:
@@ -300,7 +300,7 @@ class SlaveController:
             self.sii.refresh(now * 1e-9)
 
     def _acknowledge(self, address: int, end: int) -> None:
-        """Take back the events whose register a master has read."""
+        """Clear the events whose register a master has read."""
         if address < registers.DL_STATUS + 2 and end > registers.DL_STATUS:
             self.memory[registers.ECAT_EVENT] &= ~DL_EVENT
         if address < registers.AL_STATUS + 2 and end > registers.AL_STATUS:
@@ -328,7 +328,7 @@ class SlaveController:
         return done
 
     def _locked(self, address: int, end: int) -> set[int]:
-        """Return the registers of sync managers that are on: place, length and control can only be set while off."""
+        """Return the registers of active sync managers: address, length and control can only be changed while off."""
         if address >= SYNC_MANAGERS_END or end <= registers.SYNC_MANAGERS:
             return set()
         size = registers.SYNC_MANAGER_SIZE
@@ -340,8 +340,6 @@ class SlaveController:
         return locked
 
     def _react(self, address: int, end: int, data: bytes | bytearray, now: int) -> None:
-        """Act on a write to registers from `address` to `end`."""
-
         def has(first: int, size: int) -> bool:
             return address < first + size and end > first
 
@@ -379,7 +377,7 @@ class SlaveController:
                 self.settings_changed = True
 
     def _step_reset(self, byte: int) -> None:
-        """Count the letters of the reset sequence, each written by itself."""
+        """Advance in the reset sequence, whose letters are written one by one."""
         self._reset_step = self._reset_step + 1 if byte == RESET_SEQUENCE[self._reset_step] else 0
         self.memory[registers.RESET] = self._reset_step
         if self._reset_step == len(RESET_SEQUENCE):
@@ -388,7 +386,7 @@ class SlaveController:
 
 
 def _bits(unit: Fmmu, low: int, high: int) -> tuple[int, int, int, int]:
-    """Return of the logical bytes from `low` to `high` the first mapped bit, how many, and where they lie in memory."""
+    """Return, for logical bytes `low` to `high`: first mapped bit, number of bits, first bit in memory, bytes there."""
     first = max(unit.logical_bit, 8 * low)
     count = min(unit.logical_bit + unit.num_bits, 8 * high) - first
     physical = unit.physical_bit + first - unit.logical_bit

@@ -1,7 +1,7 @@
 """Frames of EtherCAT and the datagrams in them (ETG.1000.4, clause 5).
 
 An Ethernet frame of EtherType 88A4h, or the payload of a UDP datagram, holds two bytes of header (11 bits of length, 4
-of type) and datagrams one behind the other: command, index, address, length, interrupt, data, working counter.
+of type) and consecutive datagrams: command, index, address, length, interrupt, data, working counter.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class DatagramCommand(IntEnum):
 
 
 class DatagramPlace(NamedTuple):
-    """Where a datagram lies in a frame: command, first byte of its header, length of its data [bytes]."""
+    """Place of a datagram in a frame: command, first byte of its header, length of its data [bytes]."""
 
     command: int
     at: int
@@ -54,8 +54,8 @@ class DatagramPlace(NamedTuple):
 class Datagram(NamedTuple):
     """A datagram by itself.
 
-    `address` has 32 bits: the low 16 are the station's, the high 16 that in its memory. `number` is its index, by which
-    a master knows it again.
+    `address` has 32 bits: the low 16 are the station's address, the high 16 the address in its memory. `number` is its
+    index, by which a master recognises it.
     """
 
     command: int
@@ -67,7 +67,7 @@ class Datagram(NamedTuple):
 
 
 def at_station(command: int, station: int, offset: int, data: bytes, number: int = 0) -> Datagram:
-    """Return a datagram for a station's memory; of auto-increment addresses the first station is 0, the next -1."""
+    """Return a datagram for a station's memory; with auto-increment addresses the first station is 0, the next -1."""
     return Datagram(command, (station & 0xFFFF) | offset << 16, data, number=number)
 
 
@@ -88,7 +88,7 @@ def build_frame(datagrams: Sequence[Datagram]) -> bytes:
 
 
 def begin(frame: bytes | bytearray) -> int | None:
-    """Return where the EtherCAT header begins in an Ethernet frame; None: it is of another protocol."""
+    """Return the position of the EtherCAT header in an Ethernet frame; None for a frame of another protocol."""
     if frame[12:14] == ETHERTYPE:
         return ETHERNET
     if frame[12:14] == VLAN and frame[16:18] == ETHERTYPE:
@@ -97,9 +97,10 @@ def begin(frame: bytes | bytearray) -> int | None:
 
 
 def find(frame: bytes | bytearray, start: int) -> list[DatagramPlace] | None:
-    """Return the datagrams of a frame whose header begins at `start`; None: the frame is not whole.
+    """Return the datagrams of a frame whose header begins at `start`; None if the frame is incomplete.
 
-    It is whole when its datagrams fill exactly the length in its header, and the last of them alone says so.
+    It is complete if its datagrams fill exactly the length in its header, and only the last of them is marked as the
+    last.
     """
     size = len(frame)
     if size < start + HEADER:
@@ -121,7 +122,7 @@ def find(frame: bytes | bytearray, start: int) -> list[DatagramPlace] | None:
 
 
 def read(frame: bytes | bytearray, start: int) -> list[Datagram]:
-    """Return the datagrams of a frame; none of one that is not whole."""
+    """Return the datagrams of a frame; empty if the frame is incomplete."""
     found = []
     for _, at, length in find(frame, start) or ():
         command, number, address, _, interrupt = struct.unpack_from("<BBIHH", frame, at)

@@ -1,8 +1,9 @@
 """The clock of a slave controller: local time, system time, its correction, SYNC0 and SYNC1 (ETG.1000.4, 6.8).
 
-Every slave has an oscillator of its own. A master measures by port receive times how long frames take, writes each
-slave's offset and delay, and then lets the first slave's system time pass all others (ARMW, FRMW): each compares, and
-corrects its rate. World time is in nanoseconds here; the world has one, the slaves have none that is right.
+Every slave has an oscillator of its own. A master measures the travel times of frames by port receive times, writes
+each slave's offset and delay, and then sends the first slave's system time through all others (ARMW, FRMW): each
+compares it and corrects its rate. World time, in nanoseconds here, is the true time; every slave's clock deviates from
+it.
 """
 
 from __future__ import annotations
@@ -12,20 +13,20 @@ import struct
 from drive_env.ethercat import registers
 
 SLOWEST_CORRECTION = 0.1  # of a clock tick: the ET1100 makes ticks of 9, 10 or 11 ns of 10
-PHASE_SHARE, RATE_SHARE = 0.25, 0.03  # of a difference, by which time and rate are corrected at each comparison; ours
+PHASE_SHARE, RATE_SHARE = 0.25, 0.03  # of a difference, corrected at each comparison; our choice
 ACTIVE, SYNC0, SYNC1 = 0x01, 0x02, 0x04
 NOT_IN_NEAR_FUTURE = 0x04  # of the activation status: the start time has passed
 WORD = 1 << 32
-TIMES = 1 << 64  # of system time [ns], which begins anew then
-MOST_PULSES = 64  # that are due together; what is farther behind is a leap of the clock, and no row of pulses
+TIMES = 1 << 64  # of system time [ns], which then wraps
+MOST_PULSES = 64  # due at once; if it is further behind, the clock has leapt, and the pulses are skipped
 
 
 class DistributedClock:
     """A slave's clock, and its registers from 0900h on.
 
     Args:
-        memory: The controller's.
-        drift: By how much its oscillator is too fast, as a share: 50e-6 is 50 ppm.
+        memory: The controller's memory.
+        drift: Share by which its oscillator is too fast: 50e-6 is 50 ppm.
         epoch: Its local time [ns] at world time 0; clocks count from power-on.
     """
 
@@ -43,8 +44,8 @@ class DistributedClock:
         self._compared: int | None = None
         self._mean = 0.0
         self._next_pulse: int | None = None  # of SYNC0, system time [ns]
-        self._next_sync1: int | None = None  # of SYNC1, once the SYNC0 came that it follows
-        self.is_measuring = False  # receive times are latched as the frame comes back
+        self._next_sync1: int | None = None  # of SYNC1, after the SYNC0 that it follows
+        self.is_measuring = False  # receive times are also latched on the frame's return
 
     # --- times ------------------------------------------------------------------------------------------------------
     def local(self, now: int) -> int:
@@ -52,16 +53,16 @@ class DistributedClock:
         return int(self._anchor_local + (now - self._anchor) * (1.0 + self._drift + self._correction))
 
     def system(self, now: int) -> int:
-        """Return system time [ns], the local one with the master's offset."""
+        """Return system time [ns]: local time plus the master's offset."""
         (offset,) = struct.unpack_from("<Q", self._memory, registers.TIME_OFFSET)
         return (self.local(now) + int(offset)) % (1 << 64)
 
     def refresh(self, now: int) -> None:
-        """Let the registers show the time `now` [ns]."""
+        """Update the registers to the time `now` [ns]."""
         struct.pack_into("<Q", self._memory, registers.SYSTEM_TIME, self.system(now))
 
     def latch(self, port: int, now: int) -> None:
-        """Keep the local time at which a frame came to a port, 0 or 1 [ns]."""
+        """Latch the local time [ns] at which a frame came to port 0 or 1."""
         local = self.local(now)
         struct.pack_into("<I", self._memory, registers.RECEIVE_TIMES + 4 * port, local % WORD)
         if port == 0:
@@ -69,7 +70,7 @@ class DistributedClock:
         self.is_measuring = port == 0
 
     def compare(self, received: int, now: int) -> None:
-        """Correct the clock by a reference's system time, its low 32 bits, that came at `now` [ns]."""
+        """Correct the clock by the low 32 bits of a reference's system time [ns], received at `now` [ns]."""
         memory = self._memory
         (delay,) = struct.unpack_from("<I", memory, registers.TIME_DELAY)
         behind = (received + delay - self.system(now)) % WORD
@@ -90,7 +91,7 @@ class DistributedClock:
         struct.pack_into("<h", memory, registers.SPEED_DIFFERENCE, speed)
 
     def restart_comparison(self, now: int) -> None:
-        """Drop the results of comparisons, as a write of the speed counter's start does."""
+        """Discard the results of comparisons, as a write of the speed counter's start does."""
         self._anchor, self._anchor_local = now, float(self.local(now))
         self._correction = self._mean = 0.0
         self._compared = None
@@ -116,7 +117,7 @@ class DistributedClock:
 
     @property
     def sync1_cycle(self) -> int:
-        """Time between two pulses of SYNC1 [ns]: one that comes after the next SYNC0 leaves that out; 0: one shot."""
+        """Time between two pulses of SYNC1 [ns], 0: one shot; a pulse after the next SYNC0 skips that SYNC0."""
         return (self._delay // self.cycle + 1) * self.cycle if self.cycle else 0
 
     @property
@@ -138,12 +139,12 @@ class DistributedClock:
                 self._memory[registers.SYNC_STATUS] = NOT_IN_NEAR_FUTURE
 
     def next_pulse(self) -> int | None:
-        """Return the world time [ns] of the next pulse of either, None without pulses."""
+        """Return the world time [ns] of the next pulse of SYNC0 or SYNC1; None without pulses."""
         pulse = self._next_sync1 if self._sync1_is_first() else self._next_pulse
         return None if pulse is None else self._world_time(pulse)
 
     def take_pulse(self, now: int) -> tuple[int, int] | None:
-        """Return the pulse due at `now` [ns], SYNC0 or SYNC1, with its world time [ns], and go on to the next."""
+        """Return the pulse due at `now` [ns], SYNC0 or SYNC1, with its world time [ns], and schedule the next."""
         if self._sync1_is_first():
             following = self._next_sync1
             if following is None or (self.system(now) - following) % TIMES >= TIMES // 2:
@@ -168,15 +169,14 @@ class DistributedClock:
         return SYNC0, self._world_time(pulse)
 
     def _sync1_is_first(self) -> bool:
-        """Return whether a pulse of SYNC1 comes next; of two at one time SYNC0 does."""
+        """Return whether SYNC1 pulses next; at equal times SYNC0 is first."""
         if self._next_sync1 is None or self._next_pulse is None:
             return self._next_sync1 is not None
         return 0 < (self._next_pulse - self._next_sync1) % TIMES < TIMES // 2
 
     def _world_time(self, system: int) -> int:
-        """Return the world time [ns] of a system time [ns]."""
         (offset,) = struct.unpack_from("<Q", self._memory, registers.TIME_OFFSET)
         local = (system - int(offset)) % TIMES
-        # The anchor is near: a pulse that has just passed lies before it.
+        # The anchor is recent: a pulse that has just passed lies before it.
         ahead = local - self._anchor_local
         return self._anchor + int(ahead / (1.0 + self._drift + self._correction)) + 1

@@ -113,7 +113,7 @@ def _clock(parent: ET.Element, mode: ClockMode) -> None:
 
 
 def _types(parent: ET.Element, objects: dict[int, ObjectDescription]) -> None:
-    """Write the types that the objects have: basic ones, and one for each object with sub-indices."""
+    """Write the data types of the objects: basic types, and one type for each object with sub-indices."""
     basic = {entry.type_name: entry.bits for one in objects.values() for entry in one.entries}
     for name, bits in sorted(basic.items()):
         row = ET.SubElement(parent, "DataType")
@@ -137,7 +137,7 @@ def _types(parent: ET.Element, objects: dict[int, ObjectDescription]) -> None:
 
 
 def _places(one: ObjectDescription) -> tuple[list[tuple[EntryDescription, int]], int]:
-    """Return the entries with their first bit, and how many there are: sub-index 0 has 16 in complete access."""
+    """Return the entries with their first bit, and the total bits: sub-index 0 has 16 in complete access."""
     places, at = [], 0
     for entry in one.entries:
         places.append((entry, at))
@@ -166,7 +166,7 @@ def _objects(parent: ET.Element, objects: dict[int, ObjectDescription]) -> None:
 
 
 def _info(parent: ET.Element, entry: EntryDescription) -> None:
-    """Write limits, where they are no others than the type's too, and the default."""
+    """Write the default, and the limits unless they are the type's."""
     if isinstance(entry.default, str):
         _text(parent, "DefaultString", entry.default)
         return
@@ -189,7 +189,7 @@ def _flags(parent: ET.Element, entry: EntryDescription) -> None:
 def _pdos(
     parent: ET.Element, device: Device, objects: dict[int, ObjectDescription], tag: str, direction: int, manager: int
 ) -> None:
-    """Write the images of a direction; where nothing is said, those not assigned together exclude each other."""
+    """Write the images of a direction; unless stated otherwise, those not assigned together exclude each other."""
     assert device.ethercat is not None, "it was looked at before"
     assigned, rules = mapped(objects, direction), device.ethercat.pdos
     rows, together = [*assigned, *not_assigned(objects, direction)], dict(assigned)

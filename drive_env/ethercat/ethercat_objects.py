@@ -1,7 +1,7 @@
-"""Objects that EtherCAT asks for, and that an EDS lists otherwise or not: 1C00h, images, 1C32h and 1C33h.
+"""Objects that EtherCAT requires and that an EDS lists differently or not at all: 1C00h, images, 1C32h and 1C33h.
 
-By 1C00h a master reads what each sync manager does, by the object of an image what is in it (ETG.1000.6, 5.6.7.4), by
-1C32h and 1C33h how a slave is synchronised (ETG.1020, 22). They are there on EtherCAT alone.
+A master reads the use of each sync manager in 1C00h, an image's content in its mapping object (ETG.1000.6, 5.6.7.4),
+and a slave's synchronisation in 1C32h and 1C33h (ETG.1020, 22). They exist only on EtherCAT.
 """
 
 from __future__ import annotations
@@ -14,15 +14,14 @@ from drive_env.dictionary.entries import ObjectDictionary, written_objects
 from drive_env.node.process_image import SYNC_MANAGER_TYPES, SYNCHRONISATION
 
 U8, U16, U32 = datatypes.UNSIGNED8, datatypes.UNSIGNED16, datatypes.UNSIGNED32
-USES = (1, 2, 3, 4)  # of sync managers 0 to 3: mailbox in and out, process data in and out
+USES = (1, 2, 3, 4)  # of sync managers 0 to 3: mailbox receive and send, process data outputs and inputs
 NANOSECOND = 1e-9  # s
-# Synchronisation types (1C32h:01, 1C33h:01), and the bits of those supported (:04): with the sync manager, with SYNC0;
-# with SYNC1 only some are.
+# Synchronisation types (1C32h:01, 1C33h:01) and the bits of supported ones (:04): with the sync manager, with SYNC0;
+# only some slaves support SYNC1.
 WITH_OUTPUTS, WITH_SYNC0, WITH_SYNC1, INPUTS_WITH_OUTPUTS = 1, 2, 3, 0x22
 SUPPORTED, SUPPORTED_SYNC1 = 0x02 | 0x04, 0x08
 TYPE, CYCLE_TIME, SUPPORTED_TYPES, LEAST_CYCLE, CALC_TIME, MISSED, TOO_SHORT, SYNC_ERROR = 1, 2, 4, 5, 6, 11, 12, 32
-# Sub-index, name, data type, access (ETG.1020, tables 61 and 62); of those that a slave may leave out, the ones that
-# say something here.
+# Sub-index, name, data type, access (ETG.1020, tables 61 and 62); of the optional ones only those that are used here.
 ROWS = (
     (TYPE, "Synchronization type", U16, "rw"),
     (CYCLE_TIME, "Cycle time", U32, "rw"),
@@ -36,7 +35,7 @@ ROWS = (
 
 
 def ethercat_objects(device: Device) -> dict[int, ODArray | ODRecord]:
-    """Return the objects that a device has on EtherCAT besides those of its EDS, or in place of them, by index."""
+    """Return the objects that a device has on EtherCAT in addition to those of its EDS or instead of them, by index."""
     assert device.ethercat is not None, "it is asked for devices with EtherCAT"
     dictionary = device.new_dictionary()
     found = {index: _image(index, image, dictionary) for index, image in device.images.items()}

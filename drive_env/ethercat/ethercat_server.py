@@ -12,21 +12,21 @@ from drive_env.ethercat.world import EtherCatWorld
 from drive_env.realtime_section import undisturbed
 
 LONGEST_WAIT = 0.05  # s until a request to stop is seen
-MOST_BEHIND = 0.25  # s; a host that slept longer does not catch up, the time is skipped
-EARLY = 100e-6  # s: select() wakes about as late
+MOST_BEHIND = 0.25  # s; after a longer pause of the host the time is skipped
+EARLY = 100e-6  # s by which cycles may begin early: select() wakes about as late
 
 
 class EtherCatServer:
-    """Serves a world over a way.
+    """Serves a world over a transport.
 
-    `run` serves in the calling thread, a with statement in a thread of its own.
+    `run` serves in the calling thread, a with statement in a separate thread.
 
     Attributes:
-        world: What is served.
-        way: Where its master is.
-        lateness: Of the cycles begun in real time [s].
+        world: The world to serve.
+        way: Connects its master.
+        lateness: Lateness of the cycles begun in real time [s].
         answer_times: How long frames waited for their answer [s].
-        skipped: Time that was not made up for [s].
+        skipped: Time that was skipped [s].
     """
 
     def __init__(self, world: EtherCatWorld, way: EtherCatWay) -> None:
@@ -64,7 +64,7 @@ class EtherCatServer:
             self._thread = None
 
     def close(self) -> None:
-        """Stop, and close the way."""
+        """Stop, and close the transport."""
         self.stop()
         self.way.close()
 
@@ -82,11 +82,11 @@ class EtherCatServer:
 
     def _receive_in_time(self, frame: bytes) -> bytes | None:
         world = self.world
-        world.time = max(world.time, min(self._now(), world.next_cycle))  # never beyond a cycle that is due
+        world.time = max(world.time, min(self._now(), world.next_cycle))  # never beyond the cycle due next
         return self._receive(frame)
 
     def _catch_up(self) -> None:
-        """Run everything due, but one cycle at most: frames that wait are not to wait for several."""
+        """Run everything due, but at most one cycle: waiting frames must not wait for several."""
         world, now = self.world, self._now()
         late = now - world.next_cycle
         if late > MOST_BEHIND:

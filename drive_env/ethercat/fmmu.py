@@ -1,4 +1,4 @@
-"""FMMUs: where a slave's memory lies in the logical address space of a master, to the bit (ETG.1000.4, 6.6)."""
+"""FMMUs: map bits of a master's logical address space to a slave's memory (ETG.1000.4, 6.6)."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 
 class Fmmu(NamedTuple):
-    """One that is active: `num_bits` from `logical_bit` on are those of the slave's memory from `physical_bit` on.
+    """An active FMMU: `num_bits` from `logical_bit` on are mapped to the slave's memory from `physical_bit` on.
 
-    Both count bits from the beginning of their memory. `first` and `end` [bytes] are the logical addresses it touches;
-    `offset` [bytes] is what is added to a logical address where all is aligned to bytes, None where it is not.
+    Both count bits from the beginning of their memory. `first` and `end` [bytes] are the logical addresses that it
+    covers; `offset` [bytes] is added to a logical address if all is aligned to bytes, otherwise it is None.
     """
 
     first: int
@@ -39,7 +39,7 @@ def parse(registers: bytes | bytearray) -> Fmmu | None:
 
 
 def copy_bits(source: bytes | bytearray, from_bit: int, target: bytearray, to_bit: int, count: int) -> None:
-    """Copy `count` bits; bit 0 is the lowest of byte 0. Bits of the target beside them stay."""
+    """Copy `count` bits; bit 0 is the lowest of byte 0. Other bits of the target are unchanged."""
     value = int.from_bytes(source, "little") >> from_bit & ((1 << count) - 1)
     mask = ((1 << count) - 1) << to_bit
     whole = int.from_bytes(target, "little") & ~mask | value << to_bit

@@ -1,6 +1,6 @@
-"""File access over EtherCAT in Bootstrap (ETG.1000.6, 5.8): a firmware image is taken, kept and given back.
+"""File access over EtherCAT in Bootstrap (ETG.1000.6, 5.8): a firmware image is received, stored and returned.
 
-An emulated drive does not run it. The image lasts as long as the slave has power.
+An emulated drive does not run it, and loses it at power-off.
 """
 
 from __future__ import annotations
@@ -37,30 +37,30 @@ class FileServer:
     """A slave's files, by name.
 
     Attributes:
-        images: What was written whole.
+        images: Completely written files.
     """
 
-    HEADER: ClassVar[int] = 6  # bytes: operation, reserved, and a number that is the operation's
+    HEADER: ClassVar[int] = 6  # bytes: operation, reserved, and a number whose meaning depends on the operation
 
     def __init__(self) -> None:
         self.images: dict[str, bytes] = {}
         self.close()
 
     def close(self) -> None:
-        """Forget a transfer that is open."""
+        """Forget an open transfer."""
         self._name: str | None = None
         self._is_read = False
         self._data = bytearray()
         self._packet = 0
 
     def request(self, message: bytes, full: int, room: int, *, is_bootstrap: bool) -> bytes | None:
-        """Return the answer to a message without its mailbox header; None without an answer.
+        """Return the answer to a message, both without mailbox header; None without an answer.
 
         Args:
             message: The message.
-            full: Bytes that the longest message from the master has; a shorter packet of data is the last.
-            room: Bytes that the longest answer has.
-            is_bootstrap: The slave is in Bootstrap; elsewhere it has no files.
+            full: Length of the longest message from the master [bytes]; a shorter data packet is the last.
+            room: Length of the longest answer [bytes].
+            is_bootstrap: Whether the slave is in Bootstrap; in other states it has no files.
         """
         operation, number = message[0], struct.unpack_from("<I", message, 2)[0]
         if not is_bootstrap:
@@ -96,7 +96,7 @@ class FileServer:
         self._data += content
         self._packet = number
         if len(content) < full - self.HEADER:
-            self.images = {self._name: bytes(self._data)}  # room for one
+            self.images = {self._name: bytes(self._data)}  # it keeps one image
             self.close()
         return _numbered(FoeOperation.ACKNOWLEDGE, number)
 

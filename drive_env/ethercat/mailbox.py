@@ -1,8 +1,8 @@
 """The mailbox of a slave: header, counter, repetition and errors (ETG.1000.4, 5.6; ETG.1000.6, 5.1).
 
 A message has six bytes of header: length, address, channel and priority, protocol and counter. The counter runs from 1
-to 7; a message with that of the one before is the same once more, and is done only once. A device that has none of a
-protocol says so by an error message of the mailbox.
+to 7; a message with the same counter as the previous one is a repetition, and not executed again. A device without a
+protocol answers it by an error message of the mailbox.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from drive_env.ethercat.foe import FileServer
 HEADER = 6
 RECEIVE, SEND = 0, 1  # sync managers
 CHANNEL, PROTOCOL, COUNTER_SHIFT, COUNTER = 0x3F, 0x0F, 4, 0x07
-MOST_WAITING = 16  # answers; more requests are not taken before some are read
+MOST_WAITING = 16  # answers; further requests are accepted only after some are read
 
 
 class MailboxProtocol(IntEnum):
@@ -50,8 +50,8 @@ class Mailbox:
     """The mailbox behind sync managers 0 and 1.
 
     Args:
-        controller: Where they are.
-        coe: Answers a CoE message; raises ValueError for none that it can be.
+        controller: Has the sync managers.
+        coe: Answers a CoE message; raises ValueError for an invalid one.
     """
 
     def __init__(self, controller: SlaveController, coe: Callable[[bytes, float], list[bytes]]) -> None:
@@ -61,25 +61,25 @@ class Mailbox:
         self.open(is_bootstrap=False)
 
     def open(self, *, is_bootstrap: bool) -> None:
-        """Begin anew: nothing has come, nothing waits."""
+        """Start empty: forget received and waiting messages."""
         self._is_bootstrap = is_bootstrap
         self._waiting: deque[tuple[int, bytes, int]] = deque()  # protocol, message, address
         self._came = 0  # counter of the last message
         self._sent = 0  # counter of the last answer
-        self._current = self._read = b""  # the answer that was put last, and the one that the master read last
-        self._delayed = b""  # one that gave way to a repetition
+        self._current = self._read = b""  # the last answer put, and the last one read by the master
+        self._delayed = b""  # an answer that a repetition has displaced
         self._repeat = False
         self.files.close()
 
     def send(self, protocol: MailboxProtocol, message: bytes, address: int = 0) -> None:
-        """Let the master read a message when its turn comes."""
+        """Queue a message for the master."""
         self._waiting.append((protocol, message, address))
 
     def work(self, now: float) -> bool:
-        """Run everything due: repeat an answer, take a message, put the next answer where the master reads.
+        """Run everything due: repeat an answer, handle a message, put the next answer into the mailbox.
 
         Returns:
-            Whether a message was taken.
+            Whether a message was handled.
         """
         controller, has_taken = self._controller, False
         receive, send = controller.managers[RECEIVE], controller.managers[SEND]
@@ -105,7 +105,6 @@ class Mailbox:
 
     # --- inside -----------------------------------------------------------------------------------------------------
     def _next(self) -> bytes:
-        """Return the next answer with its header."""
         protocol, message, address = self._waiting.popleft()
         self._sent = self._sent % COUNTER + 1
         kind = protocol | self._sent << COUNTER_SHIFT
@@ -124,7 +123,7 @@ class Mailbox:
     def _dispatch(
         self, data: bytes, length: int, channel: int, protocol: int, now: float, address: int
     ) -> MailboxError | None:
-        """Answer a message; returns the error in it, if there is one."""
+        """Answer a message; return its error, or None."""
         if length > len(data) - HEADER:
             return MailboxError.INVALID_SIZE
         if channel & CHANNEL:

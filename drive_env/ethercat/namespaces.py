@@ -1,6 +1,6 @@
 """Two network namespaces of Linux with a cable between them: slave and master on one machine, as if they were two.
 
-An EtherCAT master wants an interface of its own, and its frames must not be seen by the rest of the network.
+An EtherCAT master needs an interface of its own, and its frames must not reach the rest of the network.
 """
 
 from __future__ import annotations
@@ -22,10 +22,11 @@ class Namespaces:
     master_interface: str = "veth0"
 
     def make(self) -> None:
-        """Make them, and switch their interfaces on.
+        """Create them, and switch their interfaces on.
 
         Raises:
-            OSError: Where this system has none, a right is missing, or they exist already; nothing is left then.
+            OSError: If this system has no namespaces, a right is missing, or they exist already; nothing is created
+                then.
         """
         _check()
         there = [name for name in (self.slave, self.master) if name in existing()]
@@ -46,10 +47,10 @@ class Namespaces:
             raise
 
     def remove(self) -> bool:
-        """Remove those that exist, their cable with them; returns whether there was any.
+        """Remove the existing ones and their cable; return whether there were any.
 
         Raises:
-            OSError: Where this system has none, or a right is missing.
+            OSError: If this system has no namespaces, or a right is missing.
         """
         _check()
         there = [name for name in (self.slave, self.master) if name in existing()]
@@ -59,7 +60,7 @@ class Namespaces:
 
 
 def existing() -> list[str]:
-    """Return the names of all network namespaces that have one."""
+    """Return the existing ones among the two namespaces."""
     return [line.split()[0] for line in _ip("netns", "list").splitlines() if line.strip()]
 
 

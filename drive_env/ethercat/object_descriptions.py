@@ -1,4 +1,4 @@
-"""Descriptions of objects by EtherCAT, from an EDS: names, types, access (ETG.1000.6, 5.6.3; ETG.2000)."""
+"""Descriptions of objects for EtherCAT, made from an EDS: names, types, access (ETG.1000.6, 5.6.3; ETG.2000)."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from drive_env.dictionary.entries import INTEGER_TYPES, read_eds
 from drive_env.ethercat.ethercat_objects import ethercat_objects
 
 VARIABLE, ARRAY, RECORD = 7, 8, 9  # object codes
-PDO_MAPPING_TYPE, IDENTITY_TYPE = 0x0021, 0x0023  # records that the standard has
+PDO_MAPPING_TYPE, IDENTITY_TYPE = 0x0021, 0x0023  # records of the standard
 UNSIGNED8 = datatypes.UNSIGNED8
-# Bits of an entry's access: read and write in Pre-Op, Safe-Op, Op; mappable to outputs and inputs; kept; a setting.
+# Bits of an entry's access: read and write in Pre-Op, Safe-Op, Op; mappable to outputs and inputs; stored; a setting.
 READ, WRITE, WRITE_PRE_OP, MAPS_OUTPUT, MAPS_INPUT, BACKUP, SETTING = 0x07, 0x38, 0x08, 0x40, 0x80, 0x100, 0x200
 IMAGE = range(0x1C00, 0x1C34)
 MAPPINGS = (range(0x1600, 0x1800), range(0x1A00, 0x1C00))
@@ -27,7 +27,7 @@ TYPE_NAMES = {
 
 @dataclass(frozen=True, slots=True)
 class EntryDescription:
-    """A sub-index: type of CiA 301, length [bits], access, name, default, least and greatest value (None of a text)."""
+    """A sub-index: type of CiA 301, length [bits], access, name, default, minimum and maximum (None for a text)."""
 
     sub: int
     data_type: int

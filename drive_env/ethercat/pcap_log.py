@@ -1,4 +1,4 @@
-"""A log of all frames, as Wireshark reads them: a pcap file of Ethernet frames with nanoseconds."""
+"""A log of all frames for Wireshark: a pcap file of Ethernet frames with nanoseconds."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class PcapLog:
         epoch: Time of the file at world time 0 [s since 1970].
 
     Raises:
-        OSError: If it cannot be made.
+        OSError: If it cannot be created.
     """
 
     def __init__(self, path: Path, epoch: float = 0.0) -> None:
@@ -34,7 +34,7 @@ class PcapLog:
             self._file.write(struct.pack("<IIII", seconds, nanoseconds, len(frame), len(frame)) + frame)
 
     def close(self) -> None:
-        """End the file."""
+        """Close the file."""
         with naming(self._path):
             self._file.close()
 

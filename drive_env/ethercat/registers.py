@@ -1,8 +1,8 @@
 """The registers of a slave controller as rows (ETG.1000.4, clause 6; ET1100 data sheet, section II).
 
-A master may write the bits of `mask`; what a write sets off is in the parts that the rows belong to:
-`sii_interface.py`, `sync_manager.py`, `distributed_clock.py`, `state_machine.py`. Rows of one FMMU or sync manager
-stand for all of them.
+A master may write the bits of `mask`; the effects of a write are in the modules that the rows belong to:
+`sii_interface.py`, `sync_manager.py`, `distributed_clock.py`, `state_machine.py`. The rows of one FMMU or sync manager
+apply to all of them.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ RAM_END = REGISTERS_END + RAM_KIB * 1024
 NUM_FMMUS = NUM_SYNC_MANAGERS = 8
 
 TYPE = 0x11  # ET1100
-PORTS = 0x0F  # 0 and 1 are MII, 2 and 3 are not there
+PORTS = 0x0F  # 0 and 1 are MII, 2 and 3 do not exist
 FEATURES = 0x00CC  # FMMUs bitwise, distributed clocks of 64 bits, frames with FCS errors counted, enhanced SYNC
 
 STATION_ADDRESS, ALIAS = 0x0010, 0x0012
@@ -114,7 +114,7 @@ COUNTERS = ((RX_ERRORS, FORWARDED_ERRORS + 4), (UNIT_ERRORS, UNIT_ERRORS + 1), (
 
 
 def reset_values() -> bytearray:
-    """Return all registers after a reset, and memory of zeros behind them."""
+    """Return all registers after a reset, followed by memory of zeros."""
     memory = bytearray(RAM_END)
     for row in REGISTERS:
         memory[row.address : row.address + row.size] = row.reset.to_bytes(row.size, "little")
@@ -122,7 +122,7 @@ def reset_values() -> bytearray:
 
 
 def write_masks() -> bytes:
-    """Return which bits of each byte of the registers a master may write."""
+    """Return, for each byte of the registers, the bits that a master may write."""
     masks = bytearray(REGISTERS_END)
     for row in REGISTERS:
         masks[row.address : row.address + row.size] = row.mask.to_bytes(row.size, "little")

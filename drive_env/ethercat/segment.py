@@ -1,7 +1,7 @@
 """A segment: slaves in a line. A frame passes each of them on its way out and comes back through all.
 
-A frame that is not whole changes nothing: its datagrams must fill its length. Else the first slave counts it (030Ch),
-and those behind count that one before did (0308h).
+An incomplete frame (its datagrams must fill its length) changes nothing: the first slave counts it (030Ch), and the
+following ones count that an earlier slave did (0308h).
 """
 
 from __future__ import annotations
@@ -11,16 +11,16 @@ from collections.abc import Callable
 from drive_env.ethercat import datagrams, registers
 from drive_env.ethercat.slave import EtherCatSlave
 
-HOP = 450  # ns from one slave's port to the next one's: a metre of cable, receiver, processing unit; ours
-SOURCE, LOCAL = 6, 0x02  # a controller sets this bit of the source address: the frame has been here
+HOP = 450  # ns from one slave's port to the next one's: a metre of cable, receiver, processing unit; our choice
+SOURCE, LOCAL = 6, 0x02  # a controller sets this bit of the source address to mark a frame that has passed
 
 
 class Segment:
-    """Slaves one behind the other.
+    """Slaves in a line.
 
     Attributes:
         slaves: In the order of the line.
-        listeners: Called with time [s], frame as it was sent or came back, and whether it came back.
+        listeners: Called with time [s], the frame as sent or as returned, and whether it is the returned one.
     """
 
     def __init__(self) -> None:
@@ -39,7 +39,7 @@ class Segment:
             slave.power_on(now)
 
     def transfer(self, frame: bytes, now: float) -> bytes | None:
-        """Return an Ethernet frame without FCS as it comes back at `now` [s]; None: it does not."""
+        """Return an Ethernet frame without FCS after it has passed all slaves at `now` [s]; None if it is lost."""
         start = datagrams.begin(frame)
         if start is None:
             return None
@@ -54,14 +54,14 @@ class Segment:
         return done
 
     def transfer_payload(self, payload: bytes, now: float) -> bytes | None:
-        """Return the payload of a UDP datagram as it comes back; None: it does not."""
+        """Return the payload of a UDP datagram after it has passed all slaves; None if it is lost."""
         frame = datagrams.BROADCAST + datagrams.MASTER + datagrams.ETHERTYPE + payload
         done = self.transfer(frame, now)
         return None if done is None else done[datagrams.ETHERNET :]
 
     # --- inside -----------------------------------------------------------------------------------------------------
     def _pass(self, body: bytearray, start: int, now: float) -> bool:
-        """Let a frame pass all slaves; returns whether it was whole."""
+        """Pass a frame through all slaves; return whether it was complete."""
         places = datagrams.find(body, start)
         if places is None:
             for k, slave in enumerate(self.slaves):

@@ -20,7 +20,7 @@ COE_ENABLED = 0x01
 # Bits of the CoE details, by the names of ETG.2000.
 COE_DETAILS = {"SdoInfo": 0x02, "PdoAssign": 0x04, "PdoConfig": 0x08, "PdoUpload": 0x10, "CompleteAccess": 0x20}
 MANDATORY, FIXED_CONTENT = 0x0001, 0x0010  # of a PDO
-NOT_ASSIGNED = 0xFF  # sync manager of a PDO that none carries at first
+NOT_ASSIGNED = 0xFF  # sync manager of a PDO that is not assigned at first
 KINDS = (1, 2, 3, 4)
 FMMU_KINDS = (1, 2, 3)  # outputs, inputs, state of the mailbox
 BEFORE_CATEGORIES = 0x80  # bytes
@@ -35,7 +35,7 @@ def identity(device: Device) -> tuple[int, int, int]:
 
 
 def described(device: Device) -> Device:
-    """Return the device whose EEPROM and description file a device has: itself, or the one that its data name."""
+    """Return the device that describes this one's EEPROM and description file: itself, or the one named in its data."""
     other = "" if device.ethercat is None else device.ethercat.described_as
     return find_device(other) if other else device
 
@@ -46,12 +46,12 @@ def title(device: Device) -> str:
 
 
 def mapped(objects: dict[int, ObjectDescription], direction: int) -> list[tuple[int, list[int]]]:
-    """Return the mapping objects that the factory assigns to a direction, and the factory's entries of each."""
+    """Return the mapping objects assigned by the factory to a direction, with the factory's entries of each."""
     return [(index, _numbers(objects, index)) for index in _numbers(objects, direction)]
 
 
 def not_assigned(objects: dict[int, ObjectDescription], direction: int) -> list[tuple[int, list[int]]]:
-    """Return the others that a master can choose in Pre-Op, as `mapped` does."""
+    """Return the other mapping objects that a master can choose in Pre-Op, in the form of `mapped`."""
     assigned = _numbers(objects, direction)
     others = [index for index in objects if index in ASSIGNMENTS[direction] and index not in assigned]
     return [(index, _numbers(objects, index)) for index in others]
@@ -64,7 +64,7 @@ def _numbers(objects: dict[int, ObjectDescription], index: int) -> list[int]:
 
 
 def is_fixed(one: ObjectDescription) -> bool:
-    """Return whether a mapping object is ready-made: its entries cannot be changed."""
+    """Return whether a mapping object is ready-made: its entries are read-only."""
     return not one.entries[0].access & WRITE
 
 
@@ -76,7 +76,7 @@ def coe_attributes(behaviour: EtherCatBehaviour, objects: dict[int, ObjectDescri
 
 
 def type_of(device: Device) -> str:
-    """Return the type by which a device is ordered."""
+    """Return the device's order code."""
     assert device.ethercat is not None, "it is asked for devices with EtherCAT"
     return device.ethercat.order or Path(device.name).stem.upper()
 
@@ -87,7 +87,7 @@ def image_size(objects: dict[int, ObjectDescription], direction: int) -> int:
 
 
 class _Strings:
-    """Strings of the EEPROM, counted from 1; of ASCII, since masters read other letters in several ways, or not."""
+    """Strings of the EEPROM, counted from 1; in ASCII, since masters read other letters differently, or not at all."""
 
     def __init__(self) -> None:
         self.all: list[bytes] = []
@@ -106,10 +106,10 @@ class _Strings:
 
 
 def sii_content(device: Device, serial: int = 0, alias: int = 0) -> bytes:
-    """Return the whole EEPROM, filled up with FFh.
+    """Return the whole EEPROM, padded with FFh.
 
     Raises:
-        ValueError: For a device without EtherCAT, or whose content is longer than its EEPROM.
+        ValueError: For a device without EtherCAT, or one whose content is longer than its EEPROM.
     """
     behaviour, device = device.ethercat, described(device)
     if behaviour is None:
@@ -164,7 +164,7 @@ def _general(
     content = struct.pack("<4B", group, 0, order, name) + bytes(
         (0, details, behaviour.has_foe, 0, 0, device.num_axes, 0, 0)
     )
-    content += struct.pack("<hBBH", 0, 0, 0, 0x0011)  # two ports, MII both
+    content += struct.pack("<hBBH", 0, 0, 0, 0x0011)  # two ports, both MII
     return _category(GENERAL, content.ljust(32, b"\0"))
 
 
@@ -209,6 +209,5 @@ def entry_of(objects: dict[int, ObjectDescription], key: tuple[int, int]) -> tup
 
 
 def _mode(one: ClockMode, strings: _Strings) -> bytes:
-    """Return an operation mode of the clocks."""
     times = (one.cycle0, one.shift0, one.shift1, one.factor1, one.activation, one.factor0)
     return struct.pack("<IiihHhBB4s", *times, strings.number(one.name), strings.number(one.title), bytes(4))

@@ -1,7 +1,7 @@
-"""The EEPROM interface of a slave controller, 0500h and on (ETG.1000.4, 6.5): a master reads and writes the SII by it.
+"""The EEPROM interface of a slave controller, 0500h and on (ETG.1000.4, 6.5): for the master's access to the SII.
 
-A command is written with its address or after it, is busy for a while, and leaves up to 8 bytes in 0508h. Words 0 to 7
-configure the controller: it reads them at power-on, and again for the command reload, if their CRC is right.
+A command is written with or after its address, is busy for a while, and puts up to 8 bytes into 0508h. Words 0 to 7
+configure the controller: it reads them at power-on and at the command reload, and uses them if their CRC is right.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ ALIAS_WORD = 4
 
 
 def checksum(content: bytes | bytearray) -> int:
-    """Return the CRC over the first seven words: polynomial x^8 + x^2 + x + 1 from FFh on (ETG.2010)."""
+    """Return the CRC of the first seven words: polynomial x^8 + x^2 + x + 1, start value FFh (ETG.2010)."""
     crc = 0xFF
     for byte in content[: CONFIGURATION - 2]:
         crc ^= byte
@@ -36,12 +36,12 @@ class SiiInterface:
     """The interface.
 
     Args:
-        memory: The controller's.
-        takes_time: A command is busy as long as it is on a real EEPROM.
+        memory: The controller's memory.
+        takes_time: Whether a command is busy as long as on a real EEPROM.
 
     Attributes:
-        content: The EEPROM's.
-        is_changed: The master has written to it since this was last reset.
+        content: The EEPROM's content.
+        is_changed: Whether the master has written to it since this was last reset.
     """
 
     def __init__(self, memory: bytearray, takes_time: bool) -> None:
@@ -53,7 +53,7 @@ class SiiInterface:
         self._flags = 0
 
     def power_on(self, content: bytes) -> None:
-        """Take the EEPROM's content and read its configuration, the alias, too."""
+        """Set the EEPROM's content, and load its configuration and alias."""
         self.content = bytearray(content)
         self._busy_until = -1.0
         self._flags = 0
@@ -62,20 +62,20 @@ class SiiInterface:
         self.refresh(0.0)
 
     def refresh(self, now: float) -> None:
-        """Let 0502h show the state at `now` [s]."""
+        """Update 0502h to the state at `now` [s]."""
         busy = BUSY if now < self._busy_until else 0
         struct.pack_into(
             "<H", self._memory, registers.SII_CONTROL, EIGHT_BYTES | TWO_ADDRESS_BYTES | self._flags | busy
         )
 
     def command(self, now: float) -> None:
-        """Run the command written to 0502h; none while it is busy, or the device owns the EEPROM."""
+        """Run the command written to 0502h, unless a command is busy or the device owns the EEPROM."""
         (control,) = struct.unpack_from("<H", self._memory, registers.SII_CONTROL)
         command = (control & COMMAND) >> COMMAND_SHIFT
         if now < self._busy_until or self._memory[registers.SII_ACCESS] & PDI_OWNS:
             self.refresh(now)
             return
-        self._flags &= ~(COMMAND_ERROR | WRITE_ERROR)  # a new command, or none, acknowledges the errors of the last
+        self._flags &= ~(COMMAND_ERROR | WRITE_ERROR)  # any new command acknowledges the errors of the last
         (address,) = struct.unpack_from("<I", self._memory, registers.SII_ADDRESS)
         time = READ_TIME
         if command == READ:
@@ -96,14 +96,14 @@ class SiiInterface:
         if not control & WRITE_ENABLE:
             self._flags |= WRITE_ERROR
         elif 2 * address + 2 > len(self.content):
-            self._flags |= COMMAND_ERROR  # no such address is acknowledged by the EEPROM
+            self._flags |= COMMAND_ERROR  # the EEPROM does not acknowledge such an address
         else:
             data = self._memory[registers.SII_DATA : registers.SII_DATA + 2]
             self.content[2 * address : 2 * address + 2] = data
             self.is_changed = True
 
     def _load(self) -> bool:
-        """Take the configuration over; returns whether its CRC is right."""
+        """Load the configuration; return whether its CRC is right."""
         if len(self.content) < CONFIGURATION or checksum(self.content) != self.content[CONFIGURATION - 2]:
             self._flags |= CHECKSUM_ERROR
             return False

@@ -1,4 +1,4 @@
-"""A slave: a controller, the firmware that looks after it, and the device behind it (`application.py`)."""
+"""A slave: a controller, its firmware, and the device behind it (`application.py`)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from drive_env.ethercat.mailbox import Mailbox, MailboxProtocol
 from drive_env.ethercat.state_machine import INPUTS, OUTPUTS, WITH_INPUTS, WITH_MAILBOX, StateMachine
 
 S = AlState
-LOST_PULSES = 3  # cycles of SYNC0 without a pulse after which a slave in Op gives it up; ours, as ETG.1020 leaves it
+LOST_PULSES = 3  # cycles of SYNC0 without a pulse after which a slave leaves Op; our choice (ETG.1020 has none)
 
 
 class EtherCatSlave:
@@ -20,8 +20,8 @@ class EtherCatSlave:
 
     Args:
         application: The device.
-        takes_time: The EEPROM takes its time.
-        drift: By how much its oscillator is too fast, as a share: 50e-6 is 50 ppm.
+        takes_time: Whether the EEPROM takes time.
+        drift: Share by which its oscillator is too fast: 50e-6 is 50 ppm.
         epoch: Local time [ns] of its clock at world time 0.
 
     Attributes:
@@ -56,7 +56,7 @@ class EtherCatSlave:
         self.application.power_on(now)
 
     def after_frame(self, now: float) -> None:
-        """Act on the changes of a frame."""
+        """Handle the changes made by a frame."""
         controller = self.controller
         if controller.reset_requested:
             self.power_on(now)
@@ -72,7 +72,7 @@ class EtherCatSlave:
             self._machine.request(control, now)
         state = self._machine.state
         if (state in WITH_MAILBOX or state is S.BOOTSTRAP) and self.mailbox.work(now) and state in WITH_INPUTS:
-            self._put_inputs(now)  # what a message has changed
+            self._put_inputs(now)  # a message may have changed them
         outputs = controller.managers[OUTPUTS].take()
         if outputs is not None and state is S.OP:
             self.application.outputs(outputs, now)
@@ -94,13 +94,13 @@ class EtherCatSlave:
             self._put_inputs(now)
 
     def next_event(self) -> float:
-        """Return when `run_until` has something to do [s]; infinite while there is nothing."""
+        """Return when `run_until` next has something to do [s]; inf if there is nothing."""
         pulse = self.controller.clock.next_pulse()
         deadline = self.controller.watchdog_deadline() if self._is_watched else None
         return min(float("inf") if pulse is None else pulse * 1e-9, float("inf") if deadline is None else deadline)
 
     def run_until(self, now: float) -> None:
-        """Let pulses of SYNC0 and SYNC1 and the watchdog happen that are due until `now` [s]."""
+        """Handle the pulses of SYNC0 and SYNC1 and the expiry of the watchdog that are due until `now` [s]."""
         clock = self.controller.clock
         while (pulse := clock.take_pulse(round(now * 1e9))) is not None:
             self._pulsed_at = now
@@ -134,14 +134,14 @@ class EtherCatSlave:
             self._sync0_cycle = clock.cycle * 1e-9 if clock.has_sync0 else math.inf
             self._pulsed_at = math.inf
         if new is S.OP:
-            self.controller.trigger_watchdog(now)  # the first outputs have a watchdog's time
+            self.controller.trigger_watchdog(now)  # the first outputs have a full watchdog time
             if self.controller.clock.next_pulse() is None:
                 self._pulsed_at = now
         if new in WITH_INPUTS:
             self._put_inputs(now)
 
     _had_mailbox = False
-    _sync0_cycle = math.inf  # that the slave is synchronised with [s]; infinite without SYNC0
+    _sync0_cycle = math.inf  # cycle [s] that the slave is synchronised to; inf without SYNC0
     _pulsed_at = math.inf  # time of the last pulse; infinite before the first
 
     def _put_inputs(self, now: float) -> None:

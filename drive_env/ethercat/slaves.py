@@ -1,4 +1,4 @@
-"""A world on EtherCAT from the description of a bus: each machine's devices are slaves, one behind the other."""
+"""A world on EtherCAT from the description of a bus: each machine's devices are slaves in a line."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ def build_ethercat_world(bus: Bus, *, lockstep: bool) -> EtherCatWorld:
     """Return the world of a bus on EtherCAT, its slaves not switched on yet.
 
     Args:
-        bus: Its configuration; bit rate, node numbers and faults of the wire are CAN's, and have no meaning here.
-        lockstep: Time advances by process data.
+        bus: Its configuration; bit rate, node-IDs and faults of the wire apply only to CAN.
+        lockstep: Whether time advances only with process data.
 
     Raises:
-        BusConfigError: If it cannot be.
+        BusConfigError: If the bus is impossible.
     """
     check_seed(bus)
     world = EtherCatWorld(lockstep=lockstep, cycle_time=_cycle_time(bus))
@@ -41,10 +41,10 @@ def build_ethercat_world(bus: Bus, *, lockstep: bool) -> EtherCatWorld:
 
 
 def build_beside(bus: Bus, world: World) -> EtherCatWorld:
-    """Return the slaves of a bus whose other devices are nodes of a CAN world; they live by that world's time.
+    """Return the slaves of a bus whose other devices are nodes of a CAN world; they follow that world's time.
 
     Raises:
-        BusConfigError: If it cannot be.
+        BusConfigError: If the bus is impossible.
     """
     beside = EtherCatWorld(lockstep=world.lockstep, cycle_time=_cycle_time(bus))
     try:
@@ -65,13 +65,13 @@ def add_slaves(
     """Put devices of a machine at the end of the line.
 
     Args:
-        world: Where the line is.
+        world: The world with the line.
         drives: The machine's drives.
-        store: Folder of the values that slaves store.
+        store: Folder of the slaves' stored values.
         devices: Numbers of the devices, from 0 in the order of the axes; all by default.
 
     Returns:
-        Drives of the axes that the machine leaves over, which have no motor connected; they must advance, too.
+        Drives of the last device's axes beyond the machine's, which have no motor connected; they must advance, too.
     """
     from drive_env.bus.world import without_motors
     from drive_env.ethercat.coe_node import CoeNode
@@ -90,7 +90,7 @@ def add_slaves(
 
 
 def _cycle_time(bus: Bus) -> float:
-    """Return the communication cycle of all machines [s]; BusConfigError where it is not the same."""
+    """Return the communication cycle of all machines [s]; BusConfigError if they differ."""
     try:
         rates = {row.device: find_device(row.device).communication_rate for row in bus.machines}
     except ValueError as error:

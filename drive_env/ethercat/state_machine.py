@@ -1,6 +1,6 @@
-"""The EtherCAT state machine: which state may follow which, and why one is refused (ETG.1000.6, 6.4).
+"""The EtherCAT state machine: allowed transitions, and reasons of refusals (ETG.1000.6, 6.4).
 
-A state that is refused leaves the old one with the error bit, and a code says why. As long as the bit is there, only a
+After a refusal the old state stays, with the error bit and a code for the reason. While the error bit is set, only a
 request with the acknowledge bit leads upwards.
 """
 
@@ -30,8 +30,8 @@ TRANSITIONS = frozenset((
 WITH_MAILBOX = frozenset((S.PRE_OP, S.SAFE_OP, S.OP))
 WITH_INPUTS = frozenset((S.SAFE_OP, S.OP))
 RECEIVE, SEND, OUTPUTS, INPUTS = range(4)  # sync managers
-# Those that the device keeps active in a state that it enters: the working counter tells a master that it has left Op.
-# At power-on the registers are at their reset values, and nothing is deactivated.
+# Sync managers that the device keeps active in a state that it enters; by the working counter a master notices that it
+# has left Op. At power-on the registers have their reset values, and nothing is deactivated.
 ACTIVE = {
     S.INIT: (), S.BOOTSTRAP: (RECEIVE, SEND), S.PRE_OP: (RECEIVE, SEND),
     S.SAFE_OP: (RECEIVE, SEND, OUTPUTS, INPUTS), S.OP: (RECEIVE, SEND, OUTPUTS, INPUTS),
@@ -42,14 +42,14 @@ class StateMachine:
     """The states of one slave.
 
     Args:
-        controller: Where AL status is shown and sync managers are.
-        application: Who may refuse a state.
-        changed: Called after each change, before the application learns of it.
+        controller: Has AL status and the sync managers.
+        application: The device, which may refuse a state.
+        changed: Called after each change, before the application is notified.
 
     Attributes:
         state: The state.
-        has_error: The last request was refused, or an error has forced the state.
-        code: Why.
+        has_error: Whether the last request was refused, or an error has forced the state.
+        code: The reason.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class StateMachine:
         self.power_on()
 
     def power_on(self) -> None:
-        """Be in Init."""
+        """Enter Init."""
         self.state, self.has_error, self.code = S.INIT, False, Code.NO_ERROR
         self._identifies = False
         self._show()
@@ -91,7 +91,7 @@ class StateMachine:
         self._enter(new, code, now)
 
     def check_settings(self, now: float) -> None:
-        """Fall back where the master has switched a sync manager off that the state needs."""
+        """Fall back if the master has switched off a sync manager that the state needs."""
         state = self.state
         if state is S.BOOTSTRAP and self._mailboxes(is_bootstrap=True) is not Code.NO_ERROR:
             self.force(S.INIT, Code.BOOTSTRAP_MAILBOX, now)
@@ -118,13 +118,13 @@ class StateMachine:
 
     def _show(self) -> None:
         number = self._application.identification
-        if self._identifies and number and not self.has_error:  # ETG.1020: in place of a code
+        if self._identifies and number and not self.has_error:  # ETG.1020: instead of a code
             self._controller.put_al_status(self.state | IDENTIFIED, number)
             return
         self._controller.put_al_status(self.state | (ERROR if self.has_error else 0), self.code)
 
     def _check(self, new: AlState, now: float) -> AlStatusCode:
-        """Return why a change that exists is refused; one downwards never is."""
+        """Return why a transition is refused, or NO_ERROR; transitions downwards are never refused."""
         old = self.state
         if new is S.BOOTSTRAP:
             code = Code.NO_BOOTSTRAP
@@ -166,7 +166,7 @@ class StateMachine:
         return Code.NO_ERROR
 
     def _lies(self, number: int, place: MailboxPlace, *, is_mailbox: bool, is_written: bool) -> bool:
-        """Return whether a sync manager is where it must be; one without bytes must be off."""
+        """Return whether a sync manager is set as it must be; one without bytes must be off."""
         setting: SyncManagerSetting = self._controller.managers[number].setting
         if place.length == 0:
             return not setting.is_enabled

@@ -1,8 +1,8 @@
-"""A sync manager: the memory that master and device hand each other whole (ETG.1000.4, 6.7; ET1100, section I, 8).
+"""A sync manager: memory that master and device exchange as a whole (ETG.1000.4, 6.7; ET1100, section I, 8).
 
-Buffered, it has three buffers: a read gets the newest that was written to its end, and no side waits. As a mailbox it
-has one: it is full or empty, and the other side waits. An access to the first byte opens the buffer, one to the last
-closes it; what comes between is refused as long as it is not open.
+With three buffers a read gets the newest completely written one, and no side waits. As a mailbox it has one buffer,
+full or empty, and the other side waits. An access to the first byte opens the buffer, one to the last closes it; other
+accesses are refused while it is not open.
 """
 
 from __future__ import annotations
@@ -11,19 +11,19 @@ from drive_env.ethercat.application import SyncManagerSetting
 
 OFF = SyncManagerSetting(0, 0, 0, False)
 INTERRUPT_WRITE, INTERRUPT_READ, MAILBOX_FULL = 0x01, 0x02, 0x08
-NOTHING_WRITTEN = 0x30  # which buffer was written last: none
+NOTHING_WRITTEN = 0x30  # which buffer was written last: no buffer
 
 
 class SyncManager:
     """One sync manager.
 
     Attributes:
-        setting: As the master has set it.
-        end: First address behind its memory; 0 while it is off.
-        is_locked: The device has deactivated it: the master can neither read nor write its memory.
+        setting: The master's settings.
+        end: First address after its memory; 0 while it is off.
+        is_locked: Whether the device has deactivated it, so that the master can neither read nor write its memory.
         repeat_request: The bit by which the master asks for the last mailbox message again.
-        written: Bytes that the master has written whole, since the device last looked; None: none.
-        was_read: The master has read a whole buffer since the device last looked.
+        written: The buffer completely written by the master since the device last looked; None without one.
+        was_read: Whether the master has read a whole buffer since the device last looked.
     """
 
     def __init__(self) -> None:
@@ -32,7 +32,7 @@ class SyncManager:
         self.reset()
 
     def reset(self) -> None:
-        """Be empty, as after activation."""
+        """Empty it, as after activation."""
         setting = self.setting
         self.end = setting.start + setting.length if setting.is_enabled else 0
         self.is_full = False
@@ -46,7 +46,7 @@ class SyncManager:
         self._interrupts = 0
 
     def configure(self, setting: SyncManagerSetting) -> bool:
-        """Take new settings; returns whether it was switched on or off, which empties it."""
+        """Set new settings; return whether it was switched on or off, which empties it."""
         was = self.setting
         self.setting = setting
         if setting.is_enabled == was.is_enabled:
@@ -63,7 +63,7 @@ class SyncManager:
 
     # --- the master -------------------------------------------------------------------------------------------------
     def master_write(self, first: int, data: bytes | bytearray) -> bool:
-        """Write bytes from offset `first` on; returns whether it was allowed."""
+        """Write bytes from offset `first` on; return whether it was allowed."""
         setting = self.setting
         if self.is_locked or not setting.is_written_by_master or (setting.is_mailbox and self.is_full):
             return False
@@ -81,7 +81,7 @@ class SyncManager:
         return True
 
     def master_read(self, first: int, length: int) -> bytes | None:
-        """Return bytes from offset `first` on; None: not allowed."""
+        """Return bytes from offset `first` on; None if it is not allowed."""
         setting = self.setting
         if self.is_locked or setting.is_written_by_master or (setting.is_mailbox and not self.is_full):
             return None
@@ -99,13 +99,13 @@ class SyncManager:
 
     # --- the device -------------------------------------------------------------------------------------------------
     def put(self, data: bytes) -> None:
-        """Let the master read `data`, filled up with zeros; of a mailbox only when it is empty."""
+        """Put `data`, padded with zeros, where the master reads; into a mailbox only if it is empty."""
         self._publish(data[: self.setting.length].ljust(self.setting.length, b"\0"))
         self.is_full = True
         self._interrupts = INTERRUPT_WRITE
 
     def take(self) -> bytes | None:
-        """Return the bytes that the master has written since the last call; a mailbox is empty then."""
+        """Return the bytes written by the master since the last call; this empties a mailbox."""
         data, self.written = self.written, None
         if data is not None:
             self.is_full = False

@@ -1,8 +1,8 @@
-"""How a slave is synchronised: 1C32h of its outputs, 1C33h of its inputs (ETG.1020, 22).
+"""Synchronisation of a slave: 1C32h of its outputs, 1C33h of its inputs (ETG.1020, 22).
 
-SYNC0 of the distributed clocks decides: switched on before Safe-Op, outputs take effect at its pulses, and both objects
-show type 2 and its cycle. Of a device that uses SYNC1 that decides, where the master makes it, and the type is 3.
-Without clocks outputs take effect as they come.
+If SYNC0 of the distributed clocks is switched on before Safe-Op, outputs take effect at its pulses, and both objects
+show type 2 and its cycle. With a device that uses SYNC1, and if the master switches that on, SYNC1 is used instead, and
+the type is 3. Without clocks outputs take effect as they come.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from drive_env.node.axis import ObjectPort
 from drive_env.node.process_image import SYNCHRONISATION
 
 MOST = 0xFFFF  # of a counter
-# What each object can be set to.
+# The values that each object can be set to.
 TYPES = {SYNCHRONISATION[0]: (WITH_OUTPUTS, WITH_SYNC0), SYNCHRONISATION[1]: (INPUTS_WITH_OUTPUTS, WITH_SYNC0)}
 
 
@@ -40,12 +40,12 @@ class Synchronisation:
     """The objects of synchronisation, and their effects.
 
     Args:
-        device: Whose they are.
-        may_change: Tells whether they may be written now: in Pre-Op.
+        device: The device.
+        may_change: Returns whether they may be written now, which is in Pre-Op.
 
     Attributes:
-        has_sync0: Outputs take effect with SYNC0.
-        has_sync1: They do with SYNC1 in its place.
+        has_sync0: Whether outputs take effect with SYNC0.
+        has_sync1: Whether they take effect with SYNC1 instead.
     """
 
     def __init__(self, device: Device, may_change: Callable[[], bool]) -> None:
@@ -59,11 +59,11 @@ class Synchronisation:
         self.restart()
 
     def restart(self) -> None:
-        """Be as after power-on."""
+        """Reset to the state after power-on."""
         self._values = dict(self._factory)
-        self._shown: dict[tuple[int, int], int] = {}  # in place of what the master has set, while SYNC0 decides
+        self._shown: dict[tuple[int, int], int] = {}  # shown instead of the master's settings while SYNC0 is used
         self.has_sync0 = self.has_sync1 = False
-        self._came: float | None = None  # when outputs came last [s]
+        self._came: float | None = None  # when outputs last came [s]
         self._is_new = False
 
     def owns(self, entry: Entry) -> bool:
@@ -71,7 +71,7 @@ class Synchronisation:
         return (entry.index, entry.sub) in self._values
 
     def port(self, entry: Entry) -> ObjectPort:
-        """Return the way to one of them."""
+        """Return the port of one of them."""
         key = (entry.index, entry.sub)
 
         def read() -> int:
@@ -83,10 +83,9 @@ class Synchronisation:
         return ObjectPort(entry, read, partial(self._check, entry), write)
 
     def begin(self, clock: ClockSetting) -> AlStatusCode:
-        """Take the clocks as they are set before Safe-Op; return why that cannot be, or NO_ERROR.
+        """Check and apply the clocks set before Safe-Op; return the reason of a refusal, or NO_ERROR.
 
-        A cycle of SYNC0 that the device cannot keep up with, or does not know, is refused; 0 means a single pulse and
-        is taken.
+        A cycle of SYNC0 that the device cannot follow, or does not know, is refused; 0, a single pulse, is accepted.
         """
         by_sync1 = self._uses_sync1 and clock.has_sync1
         cycle = round((clock.sync1_cycle if by_sync1 else clock.sync0_cycle) / NANOSECOND)
@@ -108,18 +107,18 @@ class Synchronisation:
         return AlStatusCode.NO_ERROR
 
     def leave(self) -> None:
-        """Be in Pre-Op again: the master's settings count."""
+        """Return to Pre-Op: the master's settings count again."""
         self._shown = {}
 
     def outputs_came(self, now: float) -> None:
-        """Count outputs that come sooner after the last ones than the device's shortest cycle."""
+        """Count outputs that follow the previous ones faster than the device's shortest cycle."""
         if self._came is not None and not self.has_sync0 and now - self._came < self._shortest - NANOSECOND:
             self._count(TOO_SHORT)
         self._came, self._is_new = now, True
 
     def pulse(self) -> None:
-        """Count a pulse in Op without new outputs since the one before."""
-        missed = self._came is not None and not self._is_new  # the first outputs have begun it
+        """Count a pulse in Op without new outputs since the previous pulse."""
+        missed = self._came is not None and not self._is_new  # counted from the first outputs on
         if missed:
             self._count(MISSED)
         self._is_new = False

@@ -1,4 +1,4 @@
-"""Ways by which a master's frames come to a segment: a raw socket on a network interface, or UDP on localhost."""
+"""Transports of a master's frames to a segment: a raw socket on a network interface, or UDP on localhost."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ TIMESTAMP = 35  # SO_TIMESTAMPNS of Linux
 
 
 class EtherCatWay(Protocol):
-    """One way.
+    """A transport.
 
     Attributes:
-        name: What a user calls it.
+        name: Its name for a user.
         answered: Frames that were answered.
         lost: Frames whose answer could not be sent.
     """
@@ -33,26 +33,26 @@ class EtherCatWay(Protocol):
     lost: int
 
     def serve(self, timeout: float, pass_on: Callable[[bytes], bytes | None], late: Callable[[float], None]) -> None:
-        """Answer the frames that are there, or come within `timeout` [s].
+        """Answer the frames that are waiting, or come within `timeout` [s].
 
         Args:
             timeout: Longest wait for the first [s].
-            pass_on: Takes what came, and returns what goes back.
-            late: Is given how long after its arrival each was answered [s].
+            pass_on: Returns the answer to a frame, None if it is lost.
+            late: Called with the time from each frame's arrival to its answer [s].
         """
 
     def close(self) -> None:
-        """End it."""
+        """Close it."""
 
 
 class RawSocket:
     """Frames of EtherType 88A4h on a network interface of Linux.
 
     Args:
-        interface: Its name, as veth1.
+        interface: Its name, e.g. veth1.
 
     Raises:
-        OSError: If there is no interface of that name, or raw sockets are missing or not allowed; says what to do.
+        OSError: If there is no interface of that name, or raw sockets are missing or not allowed, with the remedy.
     """
 
     def __init__(self, interface: str) -> None:
@@ -79,12 +79,12 @@ class RawSocket:
         self._socket.setblocking(False)
 
     def serve(self, timeout: float, pass_on: Callable[[bytes], bytes | None], late: Callable[[float], None]) -> None:
-        """Answer the frames that are there, or come within `timeout` [s]; as `EtherCatWay.serve`."""
+        """Answer the frames that are waiting, or come within `timeout` [s]; as `EtherCatWay.serve`."""
         if not select.select((self._socket,), (), (), timeout)[0]:
             return
         try:
             frame, ancillary, _, address = self._socket.recvmsg(LARGEST, 64)
-        except OSError:  # the interface is down; it may come back
+        except OSError:  # the interface is down; it may come up again
             time.sleep(min(timeout, 1e-3))
             return
         if address[2] == PACKET_OUTGOING:
@@ -104,7 +104,7 @@ class RawSocket:
                 late(time.time() - seconds - nanoseconds * 1e-9)
 
     def close(self) -> None:
-        """End it."""
+        """Close it."""
         self._socket.close()
 
 
@@ -115,7 +115,7 @@ class UdpSocket:
         port: UDP port; 0 for a free one.
 
     Raises:
-        OSError: Where the port is taken.
+        OSError: If the port is taken.
     """
 
     def __init__(self, port: int = datagrams.PORT) -> None:
@@ -131,7 +131,7 @@ class UdpSocket:
         self.name = f"{LOOPBACK}:{self.port}"
 
     def serve(self, timeout: float, pass_on: Callable[[bytes], bytes | None], late: Callable[[float], None]) -> None:
-        """Answer the frames that are there, or come within `timeout` [s]; as `EtherCatWay.serve`."""
+        """Answer the frames that are waiting, or come within `timeout` [s]; as `EtherCatWay.serve`."""
         if not select.select((self._socket,), (), (), timeout)[0]:
             return
         came = time.perf_counter()
@@ -141,12 +141,12 @@ class UdpSocket:
             if answer is None:
                 return
             self._socket.sendto(answer, address)
-        except OSError:  # the answer to a client that is gone comes back as an error
+        except OSError:  # the answer to a client that has left comes back as an error
             self.lost += 1
             return
         self.answered += 1
         late(time.perf_counter() - came)
 
     def close(self) -> None:
-        """End it."""
+        """Close it."""
         self._socket.close()

@@ -21,9 +21,9 @@ def _nanoseconds(duration: float) -> int:
 class EtherCatWorld:
     """Slaves in a line and the drives behind them.
 
-    In lockstep each frame with process data (LRD, LWR, LRW) lets one communication cycle pass after it, or as many as
-    the drives' process images are apart, and nothing else does: frames take no time, and what a frame brings back was
-    there before its cycle. Otherwise time is what `run_until` says.
+    In lockstep each frame with process data (LRD, LWR, LRW), and only such a frame, is followed by one communication
+    cycle, or by as many as the drives' process images are apart. Frames take no time, and return the values from before
+    that cycle. Otherwise `run_until` sets the time.
 
     Attributes:
         segment: The line.
@@ -32,8 +32,8 @@ class EtherCatWorld:
         cycles: Communication cycles that have passed.
 
     Args:
-        lockstep: Time advances by process data.
-        cycle_time: Length of a communication cycle [s] without drives of its own.
+        lockstep: Whether time advances only with process data.
+        cycle_time: Length of a communication cycle [s] if it has no drives of its own.
     """
 
     def __init__(self, *, lockstep: bool = True, cycle_time: float = CYCLE) -> None:
@@ -44,7 +44,7 @@ class EtherCatWorld:
         self.time = 0.0
         self.cycles = 0
         self._began = 0  # when the present cycle began [ns]
-        self._passed: dict[int, int] = {}  # to when each of the drives is [ns]
+        self._passed: dict[int, int] = {}  # time that each of the drives has reached [ns]
 
     def add(self, slave: EtherCatSlave, drives: EmulatedDrives | None = None) -> None:
         """Put a slave at the end of the line; `drives` are new ones that advance with the world."""
@@ -57,20 +57,20 @@ class EtherCatWorld:
         self.segment.power_on(self.time)
 
     def receive(self, frame: bytes) -> bytes | None:
-        """Return an Ethernet frame without FCS as it comes back; None: it does not."""
+        """Return an Ethernet frame without FCS after it has passed all slaves; None if it is lost."""
         return self._after(self.segment.transfer(frame, self.time), datagrams.ETHERNET)
 
     def receive_payload(self, payload: bytes) -> bytes | None:
-        """Return the payload of a UDP datagram as it comes back; None: it does not."""
+        """Return the payload of a UDP datagram after it has passed all slaves; None if it is lost."""
         return self._after(self.segment.transfer_payload(payload, self.time), 0)
 
     def run_until(self, now: float, begins: Callable[[float], None] | None = None, early: float = 0.0) -> None:
-        """Let everything happen in its order that is due until `now` [s]; not in lockstep.
+        """Run all events due until `now` [s], in their order; not in lockstep.
 
         Args:
             now: New time of the world [s].
-            begins: Called as a communication cycle begins, with the time when it was due [s].
-            early: A cycle that is due within this time [s] after `now` happens already.
+            begins: Called at the beginning of a communication cycle, with its due time [s].
+            early: A cycle due within this time [s] after `now` happens already.
         """
         while self.next_cycle <= now + early:
             if begins is not None:
@@ -79,19 +79,19 @@ class EtherCatWorld:
         self.pass_time(now)
 
     def pass_time(self, now: float) -> None:
-        """Let pulses and watchdogs happen that are due until `now` [s]."""
+        """Handle the pulses and watchdogs that are due until `now` [s]."""
         self.time = max(self.time, now)
         for slave in self.segment.slaves:
             slave.run_until(self.time)
 
     @property
     def cycle_time(self) -> float:
-        """Length of a communication cycle [s]: of its drives the shortest one."""
+        """Length of a communication cycle [s]: the shortest one of its drives."""
         return min((drives.device.cycle for drives in self.drives), default=self._cycle_time)
 
     @property
     def image_period(self) -> float:
-        """Time between two process images [s]: of its drives the shortest one."""
+        """Time between two process images [s]: the shortest one of its drives."""
         return min((drives.image_period for drives in self.drives), default=self._cycle_time)
 
     @property
@@ -100,7 +100,7 @@ class EtherCatWorld:
         return (self._began + _nanoseconds(self.cycle_time)) / NANOSECONDS
 
     def next_event(self) -> float:
-        """Return when `run_until` has something to do next [s]."""
+        """Return when `run_until` next has something to do [s]."""
         return min(self.next_cycle, *(slave.next_event() for slave in self.segment.slaves))
 
     def cycle(self) -> None:
@@ -135,7 +135,7 @@ class EtherCatWorld:
 
     # --- inside -----------------------------------------------------------------------------------------------------
     def _after(self, done: bytes | None, start: int) -> bytes | None:
-        """Let the time to the next one pass, in lockstep, after a frame with process data."""
+        """In lockstep, let the time to the next image pass after a frame with process data; return its answer."""
         if done is not None and self.lockstep:
             start = datagrams.begin(done) or start if start else start
             if any(place.command in LOGICAL for place in datagrams.find(done, start) or ()):

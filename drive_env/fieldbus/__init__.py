@@ -1,1 +1,1 @@
-"""What every fieldbus is to those who command drives: the device as it is known there, the link, and what can fail."""
+"""The master's view of any fieldbus: the device's description, the link, and the errors."""

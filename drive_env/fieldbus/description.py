@@ -1,6 +1,6 @@
 """Description of a device for the master: its dictionary, data types, axes, time-outs and emergencies.
 
-A known device brings its own; any other CiA 402 drive is described by its EDS and CiA's defaults.
+A known device has its own; any other CiA 402 drive is described by its EDS and CiA's defaults.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from drive_env.dictionary.drive_eds import axes_of, read_types
 from drive_env.dictionary.entries import Entry, ObjectDictionary, ObjectName, written_objects
 from drive_env.dictionary.roles import VL_FACTORS, Role
 
-CYCLE = 0.001  # communication cycle where the device says nothing else [s]
+CYCLE = 0.001  # default communication cycle [s]
 
-# CiA 402-2: the profile objects of the next axis lie 800h above; where a device shifts more, its data say so.
+# CiA 402-2: the profile objects of the next axis are 800h higher; if a device shifts more objects, its data say so.
 CIA_402_OFFSETS = (AxisOffset(cia402.PROFILE_AREAS.start, cia402.SINGLE_DEVICE_TYPE, cia402.AXIS_OFFSET),)
 
-# Upper bytes of emergency codes that are of the node (CiA 301, table 26): software, and communication.
+# Upper bytes of emergency codes of the node itself (CiA 301, table 26): software, and communication.
 NODE_CODES = (range(0x60, 0x70), range(0x80, 0x83))
 
-# Communication emergencies of CiA 301 (table 26 of version 4.2), named where the device's own table has no row.
+# Communication emergencies of CiA 301 (table 26 of version 4.2), for codes without a row in the device's own table.
 EMERGENCY_NAMES = {
     0x0000: "error_reset",
     0x8110: "can_overrun",
@@ -41,9 +41,9 @@ EMERGENCY_NAMES = {
 }
 
 
-# Of a drive that is known by its EDS alone. CiA 301: 0 to 240 wait for the next SYNC, and 1 is what every device with
-# synchronous RPDOs takes. CiA 402: maximum current 6073h, in the thousandths of 6077h. Stores and restores erase flash,
-# for which users of python-canopen report up to seconds.
+# For a drive known only by its EDS. CiA 301: 0 to 240 wait for the next SYNC, and every device with synchronous RPDOs
+# accepts 1. CiA 402: maximum current 6073h, in the thousandths of 6077h. Saving and restoring erase flash, for which
+# users of python-canopen report up to seconds.
 MODE, MODE_DISPLAY = (cia402.MODE, 0), (cia402.MODE_DISPLAY, 0)
 LONGEST_TIMEOUT = 3600.0  # s: no drive takes so long, and an operating system refuses a wait of 1e300 s
 CIA_402 = MasterHints(rpdo_type=1, timeout=0.5, timeouts={0x1010: 10.0, 0x1011: 10.0})
@@ -56,12 +56,12 @@ class Description:
 
     Attributes:
         name: Name of the device, or of its EDS.
-        dictionary: Its entries, of axis 0 where there are more.
+        dictionary: Its entries, those of axis 0 if it has several axes.
         num_axes: Axes of one node.
-        device: The known device, or None.
-        hints: What else a master must know of it.
-        timeouts: Time-outs of objects that the user gave [s].
-        timeout: Time-out of the others that the user gave [s]; None takes the device's.
+        device: The known device; None if only the EDS is known.
+        hints: Further facts that a master needs.
+        timeouts: The user's time-outs of single objects [s].
+        timeout: The user's time-out of all others [s]; None: the device's.
         cycle: Time between two SYNCs [s].
         cycles_per_sync: Communication cycles of the drives in it.
     """
@@ -79,7 +79,7 @@ class Description:
 
     @property
     def answer_timeout(self) -> float:
-        """How long an answer may take where the object is not known to be slow [s]."""
+        """Longest time to an answer, unless the object is known to be slow [s]."""
         return self.hints.timeout if self.timeout is None else self.timeout
 
     def key(self, entry: Entry, axis: int) -> Key:
@@ -91,7 +91,7 @@ class Description:
         return entry.index, entry.sub
 
     def of_further_axes(self) -> dict[Key, tuple[Entry, int]]:
-        """Return the listed objects of further axes: key -> entry of the first axis, and which axis it is of."""
+        """Return the listed objects of further axes: key -> entry of the first axis, and the axis."""
         found: dict[Key, tuple[Entry, int]] = {}
         for entry in self.dictionary:
             for axis in range(1, self.num_axes):
@@ -101,7 +101,7 @@ class Description:
         return found
 
     def shown_by(self, entry: Entry) -> Entry:
-        """Return the entry that shows another one: 6061h shows a 6060h that can only be written (CiA 402)."""
+        """Return the readable entry of another one: 6061h for a 6060h that is write-only (CiA 402)."""
         if entry.access == "wo" and (entry.index, entry.sub) == MODE and self.has(MODE_DISPLAY):
             return self.dictionary.find(MODE_DISPLAY)
         return entry
@@ -112,7 +112,7 @@ class Description:
         return f"{index:04X}h:{sub:02X} {entry.name}"
 
     def patience(self, entry: Entry) -> float:
-        """Return how long an answer about this object may take [s]."""
+        """Return the longest time to an answer about this object [s]."""
         own, usual = self.timeouts.get((entry.index, entry.sub)), self.answer_timeout
         return own if own is not None else max(usual, self.hints.timeouts.get(entry.index, usual))
 
@@ -125,7 +125,7 @@ class Description:
     def decode(self, entry: Entry, data: bytes) -> Any:
         """Return the integer, float or text of an object's bytes.
 
-        A device that answers with more bytes than the type has is forgiven; one that answers with fewer is not.
+        Surplus bytes of an answer are ignored; too few are an error.
         """
         kind = self._types[entry.index, entry.sub].data_type
         if kind in datatypes.INTEGER_TYPES or kind == datatypes.BOOLEAN:
@@ -147,11 +147,11 @@ class Description:
         return kind in datatypes.INTEGER_TYPES or kind == datatypes.BOOLEAN
 
     def size(self, entry: Entry) -> int:
-        """Return the bytes that an integer object has."""
+        """Return the number of bytes of an integer object."""
         return max(1, len(self._types[entry.index, entry.sub]) // 8)
 
     def axes_of_emergency(self, name: str, axis: int) -> Sequence[int]:
-        """Return the axes of its node that an emergency is about: the one that it tells, or all that it stopped."""
+        """Return the axes of its node that an emergency concerns: the one that it names, or all that it stopped."""
         if self.device is None or not self.device.is_of_module(name):
             return (axis,)
         code = self.device.emergencies[name].code
@@ -160,7 +160,8 @@ class Description:
     def emergency(self, code: int, extra: tuple[int, ...]) -> tuple[str, int]:
         """Return the name of an emergency and the axis of its node that sent it.
 
-        The name is that of the device's table, of CiA 301's, or the code; the axis is 0 where nothing tells it.
+        The name is that in the device's table or in CiA 301's, otherwise the code; the axis is 0 if the emergency does
+        not name it.
         """
         rows = {} if self.device is None else self.device.emergencies
         for name, row in rows.items():
@@ -173,11 +174,11 @@ class Description:
         return _cia_301_name(code), 0
 
     def emergency_names(self, code: int, number: int | None = None) -> list[str]:
-        """Return the names that an error code may have, as 603Fh and 1003h show it.
+        """Return the possible names of an error code, as in 603Fh and 1003h.
 
         Args:
             code: The emergency's code.
-            number: The device's own number of the error, which some devices have in 1003h; None: not known.
+            number: The device's own number of the error, which some devices have in 1003h; None if unknown.
         """
         has_number = number is not None and self.device is not None and self.device.canopen.quirks.history_tells_number
         rows = {} if self.device is None else self.device.emergencies
@@ -187,7 +188,7 @@ class Description:
         return found or [_cia_301_name(code)]
 
     def role(self, role: Role) -> Key | None:
-        """Return the object that plays a part, None where this drive has none that does."""
+        """Return the object with a role, None if this drive lacks it."""
         return self.dictionary.roles.get(role)
 
     def has(self, name: ObjectName) -> bool:
@@ -196,7 +197,7 @@ class Description:
 
 
 def _cia_301_name(code: int) -> str:
-    """Return the name that CiA 301 gives a code, or the code."""
+    """Return the name of a code in CiA 301, or the code itself."""
     return EMERGENCY_NAMES.get(code, f"emergency_{code:04X}h")
 
 
@@ -205,11 +206,11 @@ def describe(device: str | None, eds: str | Path | None, on_ethercat: bool = Fal
 
     Args:
         device: The name.
-        eds: The EDS in place of it.
-        on_ethercat: Objects can be written that the EDS of a known device, which is CAN's, has read only.
+        eds: The EDS instead of it.
+        on_ethercat: Whether objects are writable that the EDS of a known device, made for CAN, lists as read-only.
 
     Raises:
-        ValueError: For an unknown name, or a file that is no EDS of a drive.
+        ValueError: For an unknown name, or a file that is not an EDS of a drive.
     """
     if eds is None:
         if device is None:
@@ -226,7 +227,7 @@ def describe(device: str | None, eds: str | Path | None, on_ethercat: bool = Fal
         raise ValueError(f"there is no EDS at {path}; give the path of the drive's .eds file")
     try:
         dictionary, types = ObjectDictionary(path, roles=CIA_402_ROLES), read_types(path)
-    except Exception as error:  # the reader raises whatever the broken line leads to
+    except Exception as error:  # the reader raises any exception for a broken line
         raise ValueError(f"{path} cannot be read as an EDS: {error}; see whether CiA 306 allows that line") from error
     axes = axes_of(path, types)
     dictionary.roles |= {role: key for role, key in VL_FACTORS.items() if dictionary.has(key)}
@@ -234,7 +235,7 @@ def describe(device: str | None, eds: str | Path | None, on_ethercat: bool = Fal
 
 
 def check_timeout(timeout: float) -> float:
-    """Return a time-out [s]; ValueError for one that is not above 0 s or has no end."""
+    """Return a time-out [s]; ValueError unless it is above 0 s and finite."""
     if not 0.0 < timeout <= LONGEST_TIMEOUT:
         raise ValueError(f"a time-out of {timeout:g} s is impossible; give one above 0 s, e.g. 0.5, up to an hour")
     return timeout

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from drive_env.dictionary.aborts import ObjectAccessError
 
-# CiA 301, table 22 of version 4.2, and what to try.
+# CiA 301, table 22 of version 4.2, and the remedies.
 _ABORTS = {
     0x05030000: ("the toggle bit did not alternate", "try again; frames may be lost"),
     0x05040000: ("the drive waited too long for the next frame", "try again; frames may be lost"),
@@ -37,11 +37,11 @@ _ABORTS = {
 
 
 class BusError(Exception):
-    """The bus, or an answer over it, is not as it must be; the message says what to try."""
+    """A failure of the bus or of an answer over it; the message says what to try."""
 
 
 class OpenError(BusError):
-    """The bus cannot be opened: interface or channel are wrong, or nothing is there."""
+    """The bus cannot be opened: interface or channel are wrong, or absent."""
 
 
 class NoAnswerError(BusError, TimeoutError):
@@ -49,7 +49,7 @@ class NoAnswerError(BusError, TimeoutError):
 
 
 class RefusedError(ObjectAccessError):
-    """The drive answered with an SDO abort; a plain ObjectAccessError was found before anything was sent."""
+    """The drive answered with an SDO abort; a plain ObjectAccessError is raised before anything is sent."""
 
 
 def refused(where: str, what: str, code: int) -> RefusedError:

@@ -1,7 +1,7 @@
-"""A fieldbus as drives need it: objects of its nodes, process data, cycles, states, and a watch over the master.
+"""Protocol of a fieldbus: objects of its nodes, process data, cycles, states, and a watch over the master.
 
-`BusDrives`, the safety envelope and the tools ask a link for these and know no fieldbus. CAN is one
-(`can/can_link.py`); another one is a class with these methods and a constructor like `CanDrives`.
+`BusDrives`, the safety envelope and the tools use a link and know no fieldbus. CAN is one (`can/can_link.py`); another
+one is a class with these methods and a constructor like `CanDrives`.
 
 Nodes are counted from 0, in the order of `Link.nodes`.
 """
@@ -18,11 +18,11 @@ from mechanics.arrays import Integers
 
 
 class NoWatchdogError(BusError):
-    """A drive cannot watch over its master; the message gives the reason and the remedy."""
+    """A drive cannot watch its master; the message gives the reason and the remedy."""
 
 
 class ReceivedEmergency(NamedTuple):
-    """An emergency message of a node, which is named by its address."""
+    """An emergency message of a node, given by its address."""
 
     node: int
     code: int
@@ -35,8 +35,8 @@ class Wording(NamedTuple):
 
     Attributes:
         operational: The state in which nodes exchange process data.
-        check_samples: What to check where a node was started and sends none.
-        sign_of_life: What the nodes hear of their master, in the plural.
+        check_samples: What to check if a started node sends no samples.
+        sign_of_life: The master's messages that the nodes watch for, in the plural.
     """
 
     operational: str
@@ -45,7 +45,7 @@ class Wording(NamedTuple):
 
 
 class Timing(NamedTuple):
-    """How punctual the SYNCs of a run were: their number, those more than a cycle late, the worst lateness [s]."""
+    """Punctuality of the SYNCs of a run: their number, those more than a cycle late, the worst lateness [s]."""
 
     cycles: int
     late: int
@@ -72,39 +72,40 @@ class ObjectClient(ObjectReader, Protocol):
 
         Raises:
             ObjectAccessError: With the abort code, if the drive refuses.
-            NoAnswerError: If it does not answer within `timeout` [s]; the drive may have taken the value or not.
+            NoAnswerError: If it does not answer within `timeout` [s]; the drive may or may not have applied the value.
         """
 
     def put_back(self, index: int, sub: int, data: bytes, label: str, timeout: float) -> None:
-        """Write an object's value of before; a silent node is woken and gets more time to answer.
+        """Write an object's previous value; a silent node is woken and gets more time to answer.
 
         Raises:
             ObjectAccessError, NoAnswerError: As `write` does.
         """
 
     def ask(self, index: int, sub: int, timeout: float) -> bytes | None:
-        """Return the bytes of a short object if they come within `timeout` [s], the wait for one's turn included."""
+        """Return the bytes of a short object; None after `timeout` [s], which include the wait for one's turn."""
 
     def command(self, index: int, sub: int, data: bytes) -> None:
-        """Send a short write without waiting: neither for an answer nor for a transfer that is under way.
+        """Send a short write without waiting, neither for its answer nor for the transfer under way.
 
         Raises:
-            BusError: If the bus does not take it.
+            BusError: If the bus does not accept it.
         """
 
 
 class Outputs(Protocol):
-    """Rows of process data that go into the drives, ready to be sent."""
+    """Rows of process data for the drives, ready to be sent."""
 
     def send(self, row: int) -> None:
-        """Hand out a row: the drives take it when the next cycle begins, once.
+        """Send a row: the drives apply it when the next cycle begins, once.
 
-        What is written to an object afterwards stays, so a link that repeats its last image must follow such writes.
+        A later write to one of its objects must stay in force, so a link that repeats its last image must follow such
+        writes.
         """
 
 
 class Samples(Protocol):
-    """Process data that come out of the drives in a run of cycles; row k belongs to its k-th cycle."""
+    """Process data from the drives in a run of cycles; row k belongs to its k-th cycle."""
 
     def complete(self) -> int:
         """Return how many rows are complete."""
@@ -113,21 +114,21 @@ class Samples(Protocol):
         """Return rows `first` to `last` (excluded), each object of shape (rows, num_axes).
 
         Raises:
-            BusError: If what came is not what is mapped.
+            BusError: If the received data do not fit the mapping.
         """
 
     def missing(self, rows: int, timeout: float) -> NoAnswerError:
-        """Return the error for samples that stay out, of so many cycles and after so long a wait [s]."""
+        """Return the error for samples of `rows` cycles that did not come within `timeout` [s]."""
 
     def close(self) -> None:
-        """Take nothing more."""
+        """Stop collecting."""
 
 
 class ProcessData(Protocol):
-    """Which objects the nodes exchange in every cycle.
+    """The objects that the nodes exchange in every cycle.
 
     Attributes:
-        mapping: Its number: it grows with every change.
+        mapping: Number of the mapping, which grows with every change.
     """
 
     mapping: int
@@ -144,19 +145,19 @@ class ProcessData(Protocol):
         """Return the objects to sample: the wanted ones, then as many of the welcome ones, in their order, as fit.
 
         Args:
-            wanted: To be sampled.
-            welcome: If there is room for it.
-            played: What goes into the drives meanwhile.
+            wanted: Objects to sample.
+            welcome: Objects to sample if there is room.
+            played: Objects that are sent to the drives meanwhile.
 
         Raises:
-            ObjectAccessError: 06040042h if not even what is wanted fits.
+            ObjectAccessError: 06040042h if not even the wanted ones fit.
         """
 
     def is_mapped(self, played: tuple[Entry, ...], sampled: tuple[Entry, ...]) -> bool:
-        """Return whether cycles carry these already: exactly the played ones, if any are, and at least the samples."""
+        """Return whether cycles already carry exactly the played entries (if any) and at least the sampled ones."""
 
     def map(self, played: tuple[Entry, ...], sampled: tuple[Entry, ...]) -> None:
-        """Have cycles carry entries of every axis; the mapping into the drives stays if nothing is played.
+        """Have cycles carry entries of every axis; the mapping to the drives stays if nothing is played.
 
         Raises:
             ObjectAccessError: If they do not fit or a drive refuses them.
@@ -169,31 +170,31 @@ class ProcessData(Protocol):
         """Return rows to send, of integers of shape (cycles, num_axes) for all mapped objects; None without any."""
 
     def samples(self) -> Samples | None:
-        """Begin to collect what is mapped out of the drives. None if nothing is mapped, or in a dry run."""
+        """Begin to collect the objects mapped from the drives; None if nothing is mapped, or in a dry run."""
 
     def forget(self, nodes: Sequence[int]) -> None:
         """Forget the configuration of nodes that have restarted: nothing counts as mapped."""
 
     def restore(self, node: int) -> None:
-        """Put a node's configuration back as it was found.
+        """Restore a node's configuration.
 
         Raises:
-            BusError: If not all of it could be.
+            BusError: If not all of it could be restored.
         """
 
 
 class MasterWatch(Protocol):
-    """How the nodes notice that this process is dead, and stop their drives by themselves."""
+    """The nodes' watch over this process: they notice its death, and stop their drives by themselves."""
 
     @property
     def detection_time(self) -> float:
-        """The silence after which every node has noticed [s]; infinite while they do not watch."""
+        """The silence after which every node has noticed [s]; infinite while no watchdog is set."""
 
     def begin(self, silence: float) -> None:
-        """Have every node act when its master falls silent for `silence` [s], or less, and begin to be heard.
+        """Have every node act when its master falls silent for `silence` [s], or less, and begin to send signs of life.
 
         Raises:
-            NoWatchdogError: If a drive cannot, or watches over another master that lives.
+            NoWatchdogError: If a drive cannot, or watches another master that is alive.
             BusError: If a node does not answer.
         """
 
@@ -210,10 +211,10 @@ class MasterWatch(Protocol):
         """
 
     def end(self) -> None:
-        """Stop the signs of life, since the watchdogs are given up or were not wanted."""
+        """Stop the signs of life, since the watchdogs are given up or not wanted."""
 
     def is_set(self, node: int) -> bool:
-        """Return whether a node's watchdog was set and not put back."""
+        """Return whether a node's watchdog was set and not yet restored."""
 
     def is_in_force(self, node: int) -> bool:
         """Return whether a node, asked, still watches over this master.
@@ -223,33 +224,33 @@ class MasterWatch(Protocol):
         """
 
     def holds(self, key: Key) -> bool:
-        """Return whether the watchdogs in force depend on an object, so that the program must not change it."""
+        """Return whether the watchdogs in force depend on an object; the program must not change it then."""
 
     def restore(self, node: int) -> None:
-        """Put a node's watchdog back as it was found. The caller has proved that its axes are off.
+        """Restore a node's watchdog. The caller has proved that its axes are off.
 
         Raises:
-            BusError: If the node did not take all of it.
+            BusError: If the node did not accept all of it.
         """
 
     def forget(self, node: int) -> None:
-        """Forget the watchdog found: the node was reset."""
+        """Forget the watchdog's previous settings: the node was reset."""
 
     def take_rival(self) -> str:
-        """Return, once, which other program keeps the nodes from noticing this one's death; "" if none does."""
+        """Return, once, the other program that keeps the nodes from noticing this one's death; "" if there is none."""
 
 
 class OtherMastersHeard(Protocol):
-    """Tells whether another master commands the nodes."""
+    """Detects another master of the nodes."""
 
     def check(self) -> None:
-        """Raise BusError, with the frame that was heard, if one does."""
+        """Raise BusError, with the frame that was heard, if there is one."""
 
 
 class Link(Protocol):
     """A fieldbus with the nodes of some drives.
 
-    Time passes by the clock, or by cycles alone (lockstep), as the drives' pace says: the link sends a cycle
+    The drives' pace decides whether time passes by the clock or only with cycles (lockstep): the link begins a cycle
     whenever `sync` is called.
     """
 
@@ -263,7 +264,7 @@ class Link(Protocol):
 
     @property
     def wording(self) -> Wording:
-        """Names of things here, for messages."""
+        """Names of things on this link, for messages."""
 
     @property
     def process(self) -> ProcessData:
@@ -286,13 +287,13 @@ class Link(Protocol):
         """Return the client for a node's objects."""
 
     def wake(self, node: int) -> None:
-        """Have a node answer about its objects that may be stopped, as it is after a master died."""
+        """Make a node answer object requests even if it was stopped, say by its master's death."""
 
     def welcome(self, node: int) -> None:
-        """Note that a node is there and is of the expected kind; read what the link must know of it."""
+        """Note that a node is there and of the expected kind; read the data that the link needs of it."""
 
     def start(self) -> None:
-        """Take the nodes to where they exchange process data."""
+        """Make the nodes operational, so that they exchange process data."""
 
     def reset(self, nodes: Sequence[int]) -> None:
         """Restart nodes as after power-on, and wait until they are back.
@@ -302,13 +303,13 @@ class Link(Protocol):
         """
 
     def take_emergencies(self) -> list[ReceivedEmergency]:
-        """Return and forget the emergencies that came, in their order."""
+        """Return and forget the received emergencies, in their order."""
 
     def time_passes(self) -> bool | None:
-        """Look whether time passes in the nodes while no cycle is sent, as it must not in lockstep.
+        """Return whether time passes in the nodes while no cycle is sent; in lockstep it must not.
 
         Returns:
-            None where nothing tells it.
+            None if the nodes cannot show it.
 
         Raises:
             BusError: If a node does not answer.
@@ -321,31 +322,31 @@ class Link(Protocol):
     def hand_out(self, words: Sequence[tuple[int, Key, bytes]]) -> None:
         """Have controlwords of several axes act in one cycle, as far as the bus can: axes may share a load.
 
-        Each is written by a transfer of its own afterwards, which follow one another.
+        Afterwards each one is also written by a separate transfer.
 
         Args:
-            words: Of each axis its node, the object there and the bytes that it gets.
+            words: For each axis its node, the object there and the bytes to write.
         """
 
     def sync(self) -> None:
-        """Begin a cycle: the drives take the values handed out since the one before, and sample.
+        """Begin a cycle: the drives apply the rows sent since the previous one, and sample.
 
         Raises:
-            BusError: If the bus does not take it.
+            BusError: If the bus does not accept it.
         """
 
     def receive(self, timeout: float = 0.0) -> bool:
-        """Wait up to `timeout` [s] for something to come, and take it; return whether something did.
+        """Wait up to `timeout` [s] for a message, and handle it; return whether one came.
 
         Raises:
             BusError: If the bus is gone.
         """
 
     def wait(self, done: Callable[[], bool], timeout: float) -> bool:
-        """Receive until `done()` or until `timeout` [s] has passed; return done()."""
+        """Receive until `done()` is true or `timeout` [s] has passed; return done()."""
 
     def drain(self) -> None:
         """Process the received frames, without waiting."""
 
     def close(self) -> None:
-        """Let go of the bus."""
+        """Close the bus."""

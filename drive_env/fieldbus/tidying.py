@@ -1,4 +1,4 @@
-"""Putting a drive back as it was: every step is tried, also after one that failed; the error names what failed."""
+"""Restoring a drive: every step is tried, even after one failed; the error names those that failed."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from collections.abc import Callable
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.fieldbus.errors import BusError, NoAnswerError
 
-SILENT = 2  # steps in a row without an answer, after which a node is not asked any more: each takes seconds
+SILENT = 2  # consecutive steps without an answer after which the node is not asked any more: each takes seconds
 
 
 class Tidying:
-    """Steps of which none prevents another; all of them are tried unless the node is silent."""
+    """Independent steps, all of which are tried unless the node is silent."""
 
     def __init__(self) -> None:
         self._failures: list[str] = []
         self._silent = 0
 
     def step(self, act: Callable[[], None]) -> None:
-        """Take a step; a failure is remembered."""
+        """Run a step; a failure is remembered."""
         if self._silent >= SILENT:
             return
         try:

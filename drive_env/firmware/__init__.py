@@ -1,4 +1,4 @@
-"""What runs inside the drive: the record, what all drives share, and a list of stages for each kind of drive."""
+"""The firmware of drives: the record, the parts that all drives share, and a list of stages for each kind of drive."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ _FOLDER = Path(__file__).parent
 
 
 def firmware_names() -> list[str]:
-    """Return the names of the lists of stages there are."""
+    """Return the names of the lists of stages."""
     return sorted(path.parent.name for path in _FOLDER.glob("*/stages.py"))
 
 
 @cache
 def checked_firmware(name: str) -> str:
-    """Return a name of a list of stages; ValueError for one that there is not, with those there are."""
+    """Return a name of a list of stages; ValueError for an unknown one, listing the known ones."""
     if name not in firmware_names():
         near = did_you_mean(str(name), firmware_names())
         raise ValueError(f"no firmware is named {name!r}; there are {', '.join(firmware_names())}{near}")
@@ -30,13 +30,13 @@ def checked_firmware(name: str) -> str:
 
 
 def motor_kinds(name: str) -> tuple[str, ...]:
-    """Return the kinds of motor that the stages of a firmware turn; nothing is composed for it."""
+    """Return the kinds of motor that a firmware supports, without composing it."""
     kinds: tuple[str, ...] = importlib.import_module(f"drive_env.firmware.{checked_firmware(name)}").MOTOR_KINDS
     return kinds
 
 
 def default_motor(name: str) -> str:
-    """Return the motor of the catalogue that a firmware's drives have where nothing is said."""
+    """Return the default motor of a firmware's drives, from the catalogue."""
     motor: str = importlib.import_module(f"drive_env.firmware.{checked_firmware(name)}").DEFAULT_MOTOR
     return motor
 

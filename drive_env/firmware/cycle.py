@@ -26,10 +26,10 @@ from mechanics.kernels.calls import call_hook, next_number
 from mechanics.kernels.compiled import cached, inlined, stage
 from mechanics.plant import PackedPlant
 
-# How a played or written value acts on a field.
+# Effects of a played or written value on a field.
 REAL, INTEGER, CONTROLWORD, MODE, SET_POINT, WHOLE_SET_POINT = 0, 1, 2, 3, 4, 5
 
-# Time constant of the speed that decides whether the motor rotates [s]: encoder noise must not light bit 14.
+# Time constant of the speed that decides whether the motor rotates [s]: encoder noise must not set bit 14.
 ACTIVITY_TIME = 0.02
 
 Stage = Callable[..., Any]
@@ -49,16 +49,16 @@ class Rates(Bundle):
     substeps: int  # physics steps per window
     # Share of each tick's torque in the mean of each physics step, shape (substeps, ticks).
     weights: Matrix
-    # The same times the time from the step's middle to the tick's [s].
+    # The same, times the time from the step's middle to the tick's [s].
     moments: Matrix
 
 
 @dataclass(eq=False)
 class Call(Bundle):
-    """What a run plays and samples; values are SI.
+    """Played and sampled values of a run, in SI.
 
     `before` and `after` are addresses of hooks or 0. They are called with `data`, a group's first axis and its number
-    of axes, in the thread that runs the group; where `before` returns 0 the group stays as it is.
+    of axes, in the thread that runs the group; if `before` returns 0 the group is not run.
     """
 
     values: Cube  # (cycles, objects, all axes)
@@ -86,26 +86,26 @@ call_at, fleet_at = reader(Call), reader(Fleet)
 
 @dataclass(frozen=True)
 class FirmwareStages:
-    """What a drive's firmware is made of, beside what all drives share; a stage is a compiled function.
+    """The parts of a drive's firmware besides those that all drives share; a stage is a compiled function.
 
     Attributes:
-        name: Of the list; no two may have the same.
-        parameters, state: Fields that its stages have in the record beside those of `common/fields.py`.
-        causes: What it watches, see `protection_of`.
+        name: Unique name of the list. parameters, state: Fields of its stages in the record, in addition to those of
+            `common/fields.py`.
+        causes: Its causes, see `protection_of`.
         begin_period: Stages (drive, rates) at the beginning of a supervision period.
-        measure: Stages (drive, lane, dt) before protection looks at its causes.
-        switch: Stages (drive, lane, dt) between automaton and mode: start-up, commutation, what switches the power
+        measure: Stages (drive, lane, dt) before protection checks the causes.
+        switch: Stages (drive, lane, dt) between automaton and mode: start-up, commutation, switching of the power
             stage.
         tell: Stages (drive, lane) after the mode: status objects of the device's own.
         end_period: Stages (drive, rates) at the end of a supervision period.
         window: Stages (drive, rates): sensors and outer loops, once per window.
         tick: Stages (drive, rates, k): current loop and power stage, in tick k of a window.
-        power_on: Stages (drive, lane) that begin anew what belongs to its own fields.
-        halt: Stages (drive, lane) that take its own fields of a machine that left physics back to finite numbers.
-        remote: Stage (drive, lane) -> whether the axis takes commands; one that does not ignores the controlword, and
+        power_on: Stages (drive, lane) that reset its own fields.
+        halt: Stages (drive, lane) that reset its own fields of a diverged machine to finite numbers.
+        remote: Stage (drive, lane) -> whether the axis takes commands; otherwise it ignores the controlword, and
             statusword bit 9 is 0. None: always.
-        tells_all: Whether a drive in fault tells of further errors, see `protection_of`.
-        faults_when_off: Whether it goes into fault before it is switched on, too, see `protection_of`.
+        tells_all: Whether a drive in fault reports further errors, see `protection_of`.
+        faults_when_off: Whether it also goes into fault before it is switched on, see `protection_of`.
     """
 
     name: str
@@ -130,24 +130,24 @@ class Firmware(NamedTuple):
     """A drive's firmware, composed and ready to be compiled at its first use.
 
     Attributes:
-        layout: Of its records.
-        causes: What it watches; an emergency in a record's queue is a row of it, plus 1.
-        machinery: Makes the bundle of what a run knows of a group of machines: records, reals and integers (the
-            records' memory, shape (blocks, numbers per record)), plant, rates, motion (scratch, (7, 8 blocks)),
-            first_axis (number of the group's first axis in a call's rows), num_axes.
-        run: (fleet address, call address, start, cycles, first, last) -> whether a machine has left physics. Runs
-            groups for whole communication cycles from `start` up to `cycles`, taking turns with other threads; `first`
-            and `last` say whether the call's hooks are due.
-        run_drives_alone: (records, rates, periods): runs the drives without mechanics, rotors driven by their predicted
-            torque balance; the benchmark's bound.
+        layout: Layout of its records.
+        causes: Its causes; an emergency in a record's queue is its row plus 1.
+        machinery: Makes the bundle of a group of machines for a run: records, reals and integers (the records' memory,
+            shape (blocks, numbers per record)), plant, rates, motion (scratch, (7, 8 blocks)), first_axis (number of
+            the group's first axis in a call's rows), num_axes.
+        run: (fleet address, call address, start, cycles, first, last) -> whether a machine has diverged. Runs groups
+            for whole communication cycles from `start` up to `cycles`, taking turns with other threads; `first` and
+            `last` say whether the call's hooks are due.
+        run_drives_alone: (records, rates, periods): runs the drives without mechanics, with rotors driven by their
+            predicted torque balance: the benchmark's bound.
         write_events: (records, kind, values, where): processes writes of the controlword or the mode for the axes where
             the mask is true.
-        power_on: (records, where): starts the firmware anew on the axes where the mask is true: transitions 0 and 1,
+        power_on: (records, where): restarts the firmware on the axes where the mask is true: transitions 0 and 1,
             encoder at zero.
-        trip: (records, first axis, number of axes, row) -> how many axes that were in operation are in fault now, with
-            the reaction of a cause that is outside of them. Whoever knows the cause tells it: no emergency is queued.
-        communication_lost: The row of the cause that a node's network gives.
-        supervise, start_window, tick, window: The parts of a cycle, for tests that look between them.
+        trip: (records, first axis, number of axes, row) -> number of axes that went from operation into fault, with the
+            reaction of an external cause. The caller reports the cause: no emergency is queued.
+        communication_lost: The row of the cause for a lost network. supervise, start_window, tick, window: The parts of
+            a cycle, for tests between them.
     """
 
     layout: RecordLayout
@@ -219,9 +219,9 @@ def sample_row(reals, integers, samples, kinds, offsets, row, first_axis, num_ax
 
 @inlined
 def mechanics_window(records, plant, rates, motion):
-    """Step the load through one window and bring the rotors to where it has them.
+    """Step the load through one window and update the rotors by it.
 
-    `motion` is scratch, shape (7, lanes of all blocks): whole blocks are copied, since that vectorises.
+    `motion` is scratch, shape (7, lanes of all blocks): whole blocks are copied, which vectorises.
     """
     torque, moment, theta, omega = motion[0], motion[1], motion[2], motion[3]
     reaction, total, position = motion[4], motion[5], motion[6]
@@ -254,7 +254,7 @@ def mechanics_window(records, plant, rates, motion):
 
 @stage
 def meet(records, plant):
-    """Once per millisecond: brakes close and open, and the rotors learn what they turn, where that changes."""
+    """Once per millisecond: move the brakes, and update the rotors' inertia where it varies."""
     axes, copies = plant.jam.shape
     held, jam, mass, varying = plant.brake, plant.jam, plant.mass, plant.varying
     for copy in range(copies):
@@ -274,7 +274,7 @@ def meet(records, plant):
 
 @stage
 def reset_shared_state(drive, lane):
-    """Begin anew what all drives share; the encoder is at zero."""
+    """Reset the fields that all drives share; the encoder is at zero."""
     drive.fsa[lane] = fsa.NOT_READY
     drive.transition_pending[lane] = 0
     drive.holding[lane] = 0
@@ -318,7 +318,7 @@ def reset_shared_state(drive, lane):
 
 
 class _Events(NamedTuple):
-    """Stages that process what comes from outside: see `compose`."""
+    """Stages that process external events: see `compose`."""
 
     tell_state: Stage
     write_controlword: Stage
@@ -381,7 +381,7 @@ def _supervise(stages: FirmwareStages, protect: Stage, tell_state: Stage) -> Sta
 
     @stage
     def supervise(drive, rates):
-        """Run what the drive does once per supervision period."""
+        """Run the drive's work of one supervision period."""
         begin_period(drive, rates)
         for lane in range(LANES):
             if drive.live[lane] == 0 or drive.diverged[lane] == 1:
@@ -430,9 +430,9 @@ def _play_row(events: _Events, target: int) -> Stage:
 def _leave_diverged(halt: Stage) -> Stage:
     @stage
     def halt_diverged(drive, lane):
-        """Take a lane out of the world: its machine left physics; its numbers must not reach anything."""
+        """Halt a lane whose machine has diverged: its numbers must not affect anything."""
         drive.diverged[lane] = 1
-        # Seen from the bus the axis is in fault and stands.
+        # On the bus the axis is in fault and stands.
         drive.fsa[lane] = fsa.FAULTED
         drive.error_register[lane] |= protection.GENERIC_ERROR
         drive.drive_function[lane] = 0.0
@@ -451,7 +451,7 @@ def _leave_diverged(halt: Stage) -> Stage:
 
     @stage
     def leave_diverged(records, plant):
-        """Take the axes of machines that have left physics out of the world."""
+        """Halt the axes of diverged machines."""
         axes_per_copy = plant.axis_motion.shape[0]
         for copy in range(plant.diverged.shape[0]):
             if plant.diverged[copy] == 1:
@@ -571,7 +571,7 @@ def _trip(source: str, take_into_fault: Stage) -> Any:
         for axis in range(first_axis, first_axis + num_axes):
             drive = records[axis // LANES]
             lane = axis % LANES
-            # An axis whose stage is on because it is about to be enabled is in operation, too.
+            # An axis whose stage is on because it is about to be enabled also counts as in operation.
             if drive.fsa[lane] != fsa.ENABLED and drive.transition_pending[lane] != 4:
                 continue
             take_into_fault(drive, lane, cause)
@@ -582,7 +582,7 @@ def _trip(source: str, take_into_fault: Stage) -> Any:
 
 
 def _machinery(name: str, layout: RecordLayout, source: str) -> Any:
-    """Return the bundle's class; its name tells compiled code which records it has."""
+    """Return the bundle's class; its name identifies its records in compiled code."""
     columns = [
         ("records", Annotated[NDArray[np.void], types.Array(from_dtype(layout.dtype), 1, "C")]),
         ("reals", Matrix),
@@ -601,7 +601,7 @@ def compose(stages: FirmwareStages, source: str) -> Firmware:
 
     Args:
         stages: The list.
-        source: Name of the module that has it: compiled kernels are kept by its sources and all that it imports.
+        source: Name of its module: compiled kernels are stored by the module's sources and imports.
     """
     layout = RecordLayout((*fields.PARAMETERS, *stages.parameters), (*fields.STATE, *stages.state))
     machinery = _machinery(stages.name, layout, source)

@@ -1,4 +1,4 @@
-"""The drive record: everything that a drive knows, eight drives side by side, SI units throughout.
+"""The drive record: all variables of a drive, eight drives side by side, SI units throughout.
 
 A field is an array of 8 lanes, so that a stage is one loop over lanes that the compiler turns into vector
 instructions. Parameters come from the object dictionary through `dictionary/units.py`, from the motor's row and from
@@ -21,8 +21,8 @@ MAX_SUBSTEPS = 8
 class Field(NamedTuple):
     """One field of the record: `kind` is "f8" or "i4"; `depth` above 1 gives (depth, 8) values.
 
-    What a stage reads in a lane loop that should vectorise is "f8" even where it is a whole number: LLVM cannot tell
-    stores of one width from loads of another in the same record, and then leaves the loop scalar.
+    Fields that a vectorised lane loop reads are "f8" even for whole numbers: LLVM cannot separate stores of one width
+    from loads of another in the same record, and would leave the loop scalar.
     """
 
     name: str
@@ -37,15 +37,15 @@ CACHE_LINE = 64
 
 
 class RecordLayout:
-    """The fields of a device's drive records, and how they lie in memory.
+    """The fields of a device's drive records, and their memory layout.
 
     Doubles first and the whole padded to cache lines: a field of doubles is then one aligned 64-byte line.
 
     Attributes:
-        parameters: What the dictionary, the device and the machine set.
-        state: What changes while the drive runs.
+        parameters: Fields set by the dictionary, the device and the machine.
+        state: Fields that change while the drive runs.
         fields: Both.
-        dtype: Of one record of 8 lanes.
+        dtype: Type of one record of 8 lanes.
     """
 
     def __init__(self, parameters: Sequence[Field], state: Sequence[Field]) -> None:
@@ -60,8 +60,7 @@ class RecordLayout:
     def new_records(self, num_axes: int) -> NDArray[np.void]:
         """Return records for `num_axes` axes, shape (ceil(num_axes / 8),), every field at its initial value.
 
-        Lanes past the last axis are dead: they are computed, since a vector instruction computes all eight, and
-        ignored.
+        Lanes after the last axis are computed, since a vector instruction computes all eight, but ignored.
         """
         num_blocks = -(-num_axes // LANES)
         size = self.dtype.itemsize
@@ -82,7 +81,7 @@ class RecordLayout:
         return name in (self.dtype.names or ())
 
     def place(self, name: str, part: int = 0) -> tuple[bool, int]:
-        """Return whether a field is real, and the index of its lane 0 among the record's numbers of that kind."""
+        """Return whether a field is real, and the index of its lane 0 among the record's numbers of that type."""
         dtype, start = self.dtype.fields[name][:2]  # type: ignore[index]
         return dtype.base.kind == "f", start // dtype.base.itemsize + part * LANES
 

@@ -1,1 +1,1 @@
-"""A drive as an FMU: for tools that simulate a machine and import what turns it by FMI."""
+"""A drive as an FMU: for simulation tools that import it by FMI."""

@@ -1,4 +1,4 @@
-"""The drive inside an FMU: emulated drives whose variables an importer sets and gets, and whose time it lets pass."""
+"""The drive inside an FMU: emulated drives whose variables and time an importer controls."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ from mechanics.load import Load, Switch
 from mechanics.loads import BARE_SHAFT, find_load
 from mechanics.reading.untrusted import read_json
 
-SETTINGS = "drive.json"  # of an FMU, among its resources
+SETTINGS = "drive.json"  # among an FMU's resources
 NO_LOAD = "none"
 
 
 def read_settings(resources: Path) -> dict[str, str | None]:
-    """Return which drive an FMU has: device, load and motor, each a name or the path of a file among its resources.
+    """Return the drive of an FMU: device, load and motor, each a name or the path of a file among its resources.
 
     Raises:
         ValueError: For an FMU of another version of drive-env, whose variables may have other references.
@@ -58,7 +58,7 @@ def read_settings(resources: Path) -> dict[str, str | None]:
 
 
 def with_switches(load: Load) -> Load:
-    """Return a load whose every axis has limit and home switches; those that it lacks it never presses by itself."""
+    """Return a load whose every axis has limit and home switches; it never presses those that it lacked."""
     there = {(switch.kind, switch.axis) for switch in load.switches}
     others = (
         Switch(kind, axis, math.inf, -math.inf)
@@ -72,11 +72,11 @@ def with_switches(load: Load) -> Load:
 class FmuDrive(Saved):
     """A drive with its motor and its load, one of the table or a model, or `none`.
 
-    Every axis of the device turns a load; a load with more axes than the device has takes several of them.
+    Every axis of the device has a load; a load with more axes than the device needs several devices.
 
     Attributes:
         drives: The emulated drives.
-        variables: What can be set and got, in the order of their value references.
+        variables: The variables, in the order of their value references.
     """
 
     STATE = ("drives", "_given", "_applied", "_emergencies")
@@ -94,11 +94,11 @@ class FmuDrive(Saved):
         self._applied = dict(self._given)
 
     def get(self, variable: FmuVariable) -> Any:
-        """Return the value that an input or a parameter was set to, or that an output has now."""
+        """Return the set value of an input or a parameter, or the present value of an output."""
         return self._given[variable.name] if variable.name in self._given else self._present(variable)
 
     def set(self, variable: FmuVariable, value: float) -> None:
-        """Set an input or a parameter; it is checked when it acts: in the next step, or as the simulation begins."""
+        """Set an input or a parameter; it is checked when it takes effect: in the next step, or at the start."""
         whole = variable.row.kind in (INTEGER, LARGE) and float(value).is_integer()
         self._given[variable.name] = int(value) if whole else bool(value) if variable.row.kind == BOOLEAN else value
 
@@ -106,8 +106,8 @@ class FmuDrive(Saved):
         """Write the parameters that were set, in the dictionary's order.
 
         Raises:
-            ObjectAccessError: For an object that does not take its value.
-            ValueError: For a number that the load cannot have.
+            ObjectAccessError: For an object that refuses its value.
+            ValueError: For a number that is impossible for the load.
         """
         for one in self._changed(PARAMETER):
             value, where = self._given[one.name], np.isin(np.arange(self.drives.num_axes), one.axes)
@@ -118,13 +118,13 @@ class FmuDrive(Saved):
             self._applied[one.name] = value
 
     def step(self, size: float) -> None:
-        """Let inputs act and whole communication cycles pass [s]; a refused step changes nothing.
+        """Apply the inputs and let whole communication cycles pass [s]; a refused step changes nothing.
 
-        Inputs are a master's process data: they arrive once, as the step begins.
+        Inputs are a master's process data: they arrive once, at the beginning of the step.
 
         Raises:
-            ValueError: For another step, and an input that the machine cannot have.
-            ObjectAccessError: For an input that the drive's object does not take.
+            ValueError: For another step size, or an input that is impossible for the machine.
+            ObjectAccessError: For an input that the drive's object refuses.
         """
         drives, cycle = self.drives, self.drives.device.cycle
         if not size > 0.999 * cycle:
@@ -141,7 +141,6 @@ class FmuDrive(Saved):
 
     # --- inside ---------------------------------------------------------------------------------------------------
     def _present(self, one: FmuVariable) -> Any:
-        """Read the present value of a variable."""
         row, machine, axis = one.row, self.drives.machine, one.axes[0]
         number = axis // self.drives.load.num_axes
         if not isinstance(row.source, str):
@@ -163,9 +162,9 @@ class FmuDrive(Saved):
         ]
 
     def _process_data(self) -> dict[Any, Integers]:
-        """Let the inputs act that are no set-points, and return those that are: object -> a row of integers.
+        """Apply the inputs that are not set-points, and return the set-points: object -> a row of integers.
 
-        Nothing acts if an object cannot have its value.
+        No input is applied if an object cannot have its value.
         """
         drives, values, known = self.drives, dict[str, Floats](), self.drives.inside.objects.entries
         rows = {one.row.name: one.row for one in self.variables if one.row.causality == INPUT}

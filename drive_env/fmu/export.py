@@ -1,4 +1,4 @@
-"""Writing an FMU: the library packs its interface, a script that names the drive, and files of one's own."""
+"""Writing an FMU: the library packs its interface, a script that names the drive, and the user's files."""
 
 from __future__ import annotations
 
@@ -48,14 +48,14 @@ def export_fmu(file: Path, device: str, load: str, motor: str | None = None, *, 
 
     Args:
         file: New file, NAME.fmu; its name without the ending is that of the model.
-        device: Device by name, or the path of one's own.
+        device: Device by name, or the path of the user's own.
         load: Load by name, the path of an MJCF that needs no other files, or `none`.
-        motor: Motor by name, or the path of one's own; None for the device's usual one.
+        motor: Motor by name, or the path of the user's own; None: the device's usual one.
         fmi: Version of FMI, 2 or 3.
 
     Raises:
-        ValueError: For a name that is no identifier, a version without a library, a library that is not installed, and
-            what the drive cannot be made of.
+        ValueError: For a name that is not an identifier, a version without a library, a missing library, or an
+            impossible drive.
         OSError: If the file cannot be written.
     """
     standard = _standard(fmi)
@@ -72,7 +72,7 @@ def export_fmu(file: Path, device: str, load: str, motor: str | None = None, *, 
         if given is not None and given not in known and Path(given).exists()
     }
     with tempfile.TemporaryDirectory() as folder:
-        # A module of its own name: several FMUs may be loaded by one program, whose modules have their names once.
+        # A separate module name: one program may load several FMUs, and module names must be unique.
         script, packed = Path(folder) / f"drive_{uuid.uuid4().hex}.py", Path(folder) / "packed"
         script.write_text(
             SCRIPT.format(version=__version__, library=standard.library, slave=standard.slave, name=name, standard=fmi),

@@ -1,4 +1,4 @@
-"""The class that PythonFMU finds in an FMU: it registers the drive's variables, and passes an importer's calls on."""
+"""The class that PythonFMU finds in an FMU: it registers the drive's variables, and forwards an importer's calls."""
 
 from __future__ import annotations
 
@@ -58,32 +58,32 @@ _kept: list[dict[str, Any]] = []
 
 
 def keep(names: dict[str, Any]) -> None:
-    """Hold one more reference to the names of an FMU's module.
+    """Add a reference to the names of an FMU's module.
 
-    PythonFMU (0.7.0) executes the module again for each instance, and then gives up a reference to its
-    names that it had only borrowed: without another one the second instance would find them freed, and end the program.
+    PythonFMU (0.7.0) executes the module again for each instance, and then releases a borrowed reference to its names:
+    without this one the second instance would crash.
     """
     _kept.append(names)
 
 
 def _give_up_the_interpreter_once(resources: Path) -> None:
-    """Have the FMU's library give up its interpreter before the program ends, where that program is a Python.
+    """Make the FMU's library release its interpreter once, before a Python program ends.
 
-    On Linux, PythonFMU (0.7.0) and PythonFMU3 (0.3.4) give it up twice as they are unloaded: once too often where each
-    instance was freed, and the program then aborted, "corrupted double-linked list". What holds the library keeps it
-    from being unloaded earlier.
+    On Linux, PythonFMU (0.7.0) and PythonFMU3 (0.3.4) release it twice when they are unloaded: once too often if each
+    instance was freed; the program then aborted with "corrupted double-linked list". The library is held so that it is
+    not unloaded earlier.
     """
     for file in resources.parent.glob("binaries/*linux*/*.so") if sys.orig_argv else ():
         atexit.register(ctypes.CDLL(str(file)).finalizePythonInterpreter)
 
 
 class PlainData(pickle.Unpickler):
-    """Reads states alone: numbers, text, and arrays of them. A serialised state comes from outside."""
+    """Reads only states: numbers, text, and arrays of them, since a serialised state is not trusted."""
 
     KNOWN = (("numpy._core.multiarray", "_reconstruct"), ("numpy", "ndarray"), ("numpy", "dtype"))
 
     def find_class(self, module: str, name: str) -> Any:
-        """Return a class or function of arrays; UnpicklingError for anything else."""
+        """Return a class or function for arrays; UnpicklingError for any other."""
         if (module, name) not in self.KNOWN:
             raise pickle.UnpicklingError(f"the state holds {module}.{name}, which is no data; it is of no drive")
         return super().find_class(module, name)
@@ -93,7 +93,7 @@ class DriveSlave:
     """A drive as a slave of PythonFMU; the script of an FMU puts it before the library's own class.
 
     Attributes:
-        STANDARD: 2 or 3, of FMI.
+        STANDARD: Version of FMI, 2 or 3.
     """
 
     STANDARD: int
@@ -137,7 +137,7 @@ class DriveSlave:
         ))  # fmt: skip
 
     def to_xml(self, model_options: Any = ()) -> Element:
-        """Return the model description, with what this class can do."""
+        """Return the model description, with the capabilities of this class."""
         root: Element = super().to_xml(dict(model_options))  # type: ignore[misc]
         found = root.find("CoSimulation")
         assert found is not None, "the library writes it"
@@ -146,7 +146,7 @@ class DriveSlave:
         if self.STANDARD == 3:
             found.set("fixedInternalStepSize", f"{self._drive.drives.device.cycle:g}")
         else:
-            # The library leaves out which outputs are computed as the simulation begins: all of them.
+            # The library omits which outputs are computed at the start of the simulation: all of them.
             structure = root.find("ModelStructure")
             assert structure is not None, "the library writes it"
             SubElement(structure, "InitialUnknowns").extend(structure.findall("Outputs/Unknown"))
@@ -157,7 +157,7 @@ class DriveSlave:
         self._drive.begin()
 
     def do_step(self, current_time: float, step_size: float) -> bool:
-        """Let a step pass; False, with the reason in the importer's log, for one that is refused."""
+        """Let a step pass; False, with the reason in the importer's log, if it is refused."""
         try:
             self._drive.step(step_size)
         except (ValueError, ObjectAccessError) as error:

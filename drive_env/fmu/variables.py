@@ -1,4 +1,4 @@
-"""The variables of a drive's FMU, as rows; its parameters are the drive's dictionary and its load's numbers."""
+"""The variables of a drive's FMU, as rows; its parameters are the drive's objects and its load's numbers."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from drive_env.emulator.emulated_drives import EmulatedDrives
 from drive_env.master.parameters import command
 
 INPUT, OUTPUT, PARAMETER = "input", "output", "parameter"
-INTEGER, LARGE, REAL, BOOLEAN = "integer", "large", "real", "boolean"  # LARGE: beyond 32 bits with a sign
+INTEGER, LARGE, REAL, BOOLEAN = "integer", "large", "real", "boolean"  # LARGE: beyond signed 32 bits
 AXIS, MACHINE, SUPPLY, NODE = "axis", "machine", "supply", "node"
 INT32 = range(-(2**31), 2**31)
-FIRST_OF_DEVICE = 0x2000  # objects below say how a node talks
+FIRST_OF_DEVICE = 0x2000  # objects below are those of communication
 _IDENTIFIER = re.compile(r"[A-Za-z_]\w*")
 
 
 class VariableRow(NamedTuple):
-    """What variables of one kind are.
+    """Variables of one kind.
 
     Attributes:
-        name: In the FMU, behind the axis: `axis0.statusword`; of what is there once, alone.
+        name: Name in the FMU, after the axis: `axis0.statusword`; without an axis if there is only one.
         causality: INPUT, OUTPUT or PARAMETER.
         kind: INTEGER, LARGE, REAL or BOOLEAN.
-        source: The object (index and sub-index, or a role); a text is an attribute of the machines, a parameter of
-            theirs, or the kind of a switch.
-        unit: "" for none; of objects the dictionary's.
-        meaning: One line.
-        of: What has one of it: an AXIS, a MACHINE, the axes of one SUPPLY, or those of one NODE.
+        source: The object (index and sub-index, or a role); a text names an attribute or parameter of the machines, or
+            the kind of a switch.
+        unit: "" if it has none; for objects the dictionary's.
+        meaning: Description in one line.
+        of: Owner of each variable: an AXIS, a MACHINE, the axes of one SUPPLY, or those of one NODE.
     """
 
     name: str
@@ -45,7 +45,7 @@ class VariableRow(NamedTuple):
 
 
 class FmuVariable(NamedTuple):
-    """A variable: its name, its row, and the axes that it is of."""
+    """A variable: its name, its row, and its axes."""
 
     name: str
     row: VariableRow
@@ -56,7 +56,7 @@ def _object(name: str, causality: str, source: int | Role, meaning: str) -> Vari
     return VariableRow(name, causality, INTEGER, (source, 0) if isinstance(source, int) else source, "", meaning)
 
 
-# Objects that a drive lacks are left out. Inputs act in this order: targets are there when the controlword takes them.
+# Objects that a drive lacks are left out. Inputs are applied in this order, so that targets precede the controlword.
 ROWS = (
     _object("drive_mode", INPUT, Role.MODE_GATE, "the drive's own mode, which a mode of operation needs"),
     _object("mode_of_operation", INPUT, cia402.MODE, "mode of operation"),
@@ -89,7 +89,7 @@ ROWS = (
     VariableRow("emergency_count", OUTPUT, INTEGER, "count", "", "emergency messages so far"),
 )  # fmt: skip
 SWITCHES = ("left", "right", "home")
-WRITTEN = ("drive_mode", "mode_of_operation")  # when they change: an RPDO that repeats a mode is ignored
+WRITTEN = ("drive_mode", "mode_of_operation")  # written when they change: an RPDO with a repeated mode is ignored
 EMERGENCIES = ("code", "count")
 
 
@@ -98,7 +98,7 @@ def variables_of(drives: EmulatedDrives, *, is_bare: bool) -> list[FmuVariable]:
 
     Args:
         drives: Emulated drives: the axes of one node, or of as many nodes as a machine of several axes needs.
-        is_bare: Nothing is on the shafts, so that their load torque is the shaft torque.
+        is_bare: Whether the shafts have no load, so that their load torque is the shaft torque.
     """
     groups, rows = _groups(drives), []
     known = drives.inside.objects.entries
@@ -123,7 +123,7 @@ def variables_of(drives: EmulatedDrives, *, is_bare: bool) -> list[FmuVariable]:
 
 
 def _groups(drives: EmulatedDrives) -> Mapping[str, list[tuple[int, ...]]]:
-    """Return the axes that have something in common, by what that is."""
+    """Return the groups of axes that share a variable, by owner."""
     axes = range(drives.num_axes)
 
     def by(numbers: Iterator[int]) -> list[tuple[int, ...]]:
@@ -141,7 +141,7 @@ def _groups(drives: EmulatedDrives) -> Mapping[str, list[tuple[int, ...]]]:
 
 
 def _of_entry(row: VariableRow, entry: Entry) -> VariableRow:
-    """Return a row with what the dictionary says of its object."""
+    """Return a row completed by the dictionary's data of its object."""
     assert entry.low is not None and entry.high is not None, "numbers alone are variables"
     fits = entry.low in INT32 and (entry.high in INT32 or row.causality == OUTPUT)
     return row._replace(
@@ -150,7 +150,7 @@ def _of_entry(row: VariableRow, entry: Entry) -> VariableRow:
 
 
 def _parameters(drives: EmulatedDrives) -> Iterator[VariableRow]:
-    """Yield what is set before the simulation begins: parameters of the drive that act here, and those of the load."""
+    """Yield the parameters to set before the simulation begins: effective ones of the drive, and those of the load."""
     device, objects = drives.device, drives.inside.objects
     for entry in device.new_dictionary():
         key = entry.index, entry.sub
@@ -167,6 +167,6 @@ def _parameters(drives: EmulatedDrives) -> Iterator[VariableRow]:
 
 
 def _quoted(name: str) -> str:
-    """Return a dictionary's name as FMI's structured names have it, with quotation marks where it is no identifier."""
+    """Return a dictionary's name in FMI's structured form, in quotation marks if it is not an identifier."""
     parts = name.replace("'", "").replace("\\", "").split(".")
     return ".".join(part if _IDENTIFIER.fullmatch(part) else f"'{part}'" for part in parts)

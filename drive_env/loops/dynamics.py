@@ -1,9 +1,9 @@
-"""Dynamics: the margins that outer loops must keep, by name or as numbers, and how far loops are from breaking them.
+"""Dynamics: the margins that outer loops must keep, by name or as numbers, and the loops' distance from them.
 
-The three margins of an open loop are one region around -1 that it must not enter: |L| = 1 within the phase margin,
-real L within the gain margin to either side, and the circle of radius 1/Ms. Its *clearance* is how much larger the
-region could be: 1 where a margin is just kept, 0 at -1, and below 0 where the closed loop is unstable. It changes
-continuously with the gains, which a phase margin does not where a resonance begins to cross over.
+The three margins of an open loop are one region around -1 that it must not enter: |L| = 1 within the phase margin, real
+L within the gain margin to either side, and the circle of radius 1/Ms. Its *clearance* is the factor by which the
+region could grow until the open loop enters it: 1 if a margin is just kept, 0 at -1, and below 0 if the closed loop is
+unstable. It changes continuously with the gains, unlike a phase margin when a resonance begins to cross over.
 """
 
 from __future__ import annotations
@@ -25,19 +25,18 @@ if TYPE_CHECKING:
 
 
 DEFAULT = "standard"
-# What is demanded of a machine that is not as it was tuned (load inertia at both ends of its range, stiffness x 0.8,
-# velocity P x 1.5 and x 0.67): a region smaller by this factor. Of 45 degrees, 8 dB and Ms 2 it leaves 18 degrees,
-# 3.2 dB and Ms 5.
+# Demand on a machine that differs from its tuning (load inertia at both ends of its range, stiffness x 0.8, velocity P
+# x 1.5 and x 0.67): a region smaller by this factor. 45 degrees, 8 dB and Ms 2 become 18 degrees, 3.2 dB and Ms 5.
 OFF_NOMINAL = 0.4
-INERTIA_RANGE = (0.5, 2.0)  # of the load, over that of tuning
+INERTIA_RANGE = (0.5, 2.0)  # of the load, over that of the tuning
 WIDEST_RANGE = (0.2, 5.0)
 LOWEST, HIGHEST, POINTS = (
     1.0,
     0.49,
     240,
 )  # frequencies looked at: from [Hz], up to of the velocity loop's rate, how many
-NEAR = np.linspace(-3.0, 3.0, 9)  # around a resonance of the closed loops, in its half width
-UNSTABLE = 100.0  # 1/s: a motion that grows so fast has a clearance of -1
+NEAR = np.linspace(-3.0, 3.0, 9)  # around a resonance of the closed loops, in half widths
+UNSTABLE = 100.0  # 1/s: a motion that grows at this rate has a clearance of -1
 
 
 @dataclass(frozen=True)
@@ -49,9 +48,9 @@ class Dynamics:
         phase_deg: Phase margin [degrees].
         gain_db: Gain margin, up and down [dB].
         ms: Greatest sensitivity |1 / (1 + L)|.
-        overshoot: Of a step of the set-point in csp, over the step.
-        inertia_range: Least and greatest load inertia with which they must keep a region smaller by `OFF_NOMINAL`, over
-            the one they are tuned with.
+        overshoot: Overshoot of a step of the set-point in csp, over the step.
+        inertia_range: Least and greatest load inertia, over that of the tuning, at which loops must keep a region
+            smaller by `OFF_NOMINAL`.
     """
 
     name: str
@@ -62,26 +61,26 @@ class Dynamics:
     inertia_range: tuple[float, float] = INERTIA_RANGE
 
     def clearance(self, open_loop: Complex) -> Floats:
-        """Return how much larger the region around -1 could be, of stable loops.
+        """Return the factor by which the region around -1 could grow, for stable loops.
 
         Args:
-            open_loop: L at increasing frequencies, near enough to each other to see every resonance, (..., n).
+            open_loop: L at increasing frequencies, dense enough for every resonance, (..., n).
         """
         gain, phase, each = self._distance(open_loop)
         least = each.min(axis=-1)
-        turned = np.abs(np.diff(phase)) < 180.0 / self.phase_deg  # else it wraps at 0 degrees
+        turned = np.abs(np.diff(phase)) < 180.0 / self.phase_deg  # otherwise it wraps at 0 degrees
         for value, other, where in ((gain, phase, True), (phase, gain, turned)):
             first, second = value[..., :-1], value[..., 1:]
             crosses = (first * second <= 0.0) & (first != second) & where
             share = first / np.where(crosses, first - second, 1.0)
-            # The other one there; a phase that wraps within the step is nearly 180 degrees.
+            # The other coordinate there; a phase that wraps within the step is nearly 180 degrees.
             there = np.abs(other[..., :-1] + share * np.diff(other))
             there = np.where(crosses & (turned | (value is phase)), there, np.inf)
             least = np.minimum(least, there.min(axis=-1))
         return np.asarray(least)
 
     def _distance(self, L: Complex) -> tuple[Floats, Floats, Floats]:
-        """Return gain and phase from -1, each over its margin, and how much larger the region is that ends there."""
+        """Return gain and phase from -1, each over its margin, and the size of the region whose edge passes there."""
         with np.errstate(divide="ignore", invalid="ignore"):
             gain = 20.0 / math.log(10.0) * np.log(np.abs(L)) / self.gain_db
             phase = np.degrees(np.angle(-L)) / self.phase_deg
@@ -103,14 +102,14 @@ class Dynamics:
         return inside * phase, inside * gain
 
     def slack(self, nominal: Floats, variants: Floats, overshoot: Floats) -> Floats:
-        """Return how far machines are from breaking a constraint, relative: 0 where one is just kept, (machines,).
+        """Return the relative distance of machines from violating a constraint: 0 if one is just kept, (machines,).
 
         Args:
-            nominal: Clearance of the loops as they are, (machines,).
-            variants: With inertia, stiffness and velocity P as they may become, (machines, variants).
-            overshoot: Of a csp step, over the step, (machines,).
+            nominal: Clearance of the present loops, (machines,).
+            variants: Clearance with changed inertia, stiffness and velocity P, (machines, variants).
+            overshoot: Overshoot of a csp step, over the step, (machines,).
         """
-        # Just before a machine becomes unstable its step overshoots by nearly all of it.
+        # At the stability limit the step overshoots by nearly all of it.
         least = np.minimum(nominal - 1.0, 1.0 - np.minimum(overshoot, 1.0) / self.overshoot)
         return np.asarray(np.minimum(least, (variants / OFF_NOMINAL - 1.0).min(axis=-1, initial=np.inf)))
 
@@ -128,15 +127,14 @@ def known_dynamics() -> dict[str, Dynamics]:
 def find_dynamics(text: str | Dynamics, inertia_range: str | tuple[float, float] | None = None) -> Dynamics:
     """Return dynamics by name, or by numbers: "45/8/2.0" is a phase margin in degrees, a gain margin in dB and Ms.
 
-    What a csp step may overshoot follows Ms then, along the named ones.
+    The allowed overshoot of a csp step is then interpolated over Ms between the named ones.
 
     Args:
         text: Name or numbers.
-        inertia_range: Least and greatest load inertia over the one they are tuned with, as "0.5/2"; that of `text` by
-            default.
+        inertia_range: Least and greatest load inertia over that of the tuning, e.g. "0.5/2"; that of `text` by default.
 
     Raises:
-        ValueError: For another name, numbers that no loop can keep, or a range without the load as it is.
+        ValueError: For another name, numbers that no loop can keep, or a range without the present load.
     """
     found = text if isinstance(text, Dynamics) else _by_text(text)
     return found if inertia_range is None else replace(found, inertia_range=_range(inertia_range))
@@ -177,17 +175,18 @@ def _by_text(text: str) -> Dynamics:
 def loop_clearance(
     dynamics: Dynamics, rates: LoopRates, machines: LinearMachines, gains: CascadeGains, variants: int = 1
 ) -> tuple[Floats, Floats]:
-    """Return the clearance of machines' outer loops, the least of all, and how far csp steps overshoot.
+    """Return the least clearance of machines' outer loops, and the overshoot of csp steps.
 
     Args:
-        dynamics: What they must keep.
-        rates: Of the drive.
+        dynamics: The margins to keep.
+        rates: The drive's rates.
         machines: The machines.
-        gains: Theirs.
-        variants: How many of them in a row are one machine as it is and may become: its step is as it is.
+        gains: Their gains.
+        variants: Number of consecutive machines that are variants of one machine, itself first; its step is that of the
+            first.
 
     Returns:
-        Clearance, -1 to 0 where a machine is unstable, (machines,), and the largest overshoot over the step,
+        Clearance, -1 to 0 if a machine is unstable, (machines,), and the largest overshoot over the step,
         (machines / variants,).
     """
     one = window(rates, machines, gains)

@@ -1,8 +1,8 @@
-"""The cascade as transfer functions, exact for its sampling: the drive's firmware without its limits.
+"""The cascade as transfer functions, exact for its sampling: of the drive's firmware without its limits.
 
 The winding, the rotor and an elastic load are one linear system in continuous time. The current loop samples it every
-tick, computes a duty that acts during the next one, and repeats that as often as ticks make a window; the velocity and
-the position loop see it once a window. Left out are limits, friction, quantisation, noise, and what the d axis does.
+tick and computes a duty that acts during the next one; the velocity and the position loop sample it once per window of
+several ticks. Limits, friction, quantisation, noise, and the d axis are neglected.
 
     current    C(z) = P (1 + I / (1 - z^-1))           "advanced" PI of the motion chip: I is a share of P e
     velocity   C(z) = P (1 + I / (1 - z^-1)), F(z) the second-order filter of the difference of counts
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 class KnownValue(Protocol):
-    """A value that was identified; nan with a reason where it was refused."""
+    """An identified value; nan with a reason if it was refused."""
 
     @property
     def value(self) -> float:
@@ -41,7 +41,7 @@ class KnownValue(Protocol):
 
     @property
     def reason(self) -> str:
-        """Why it was refused; "" if it was not."""
+        """The reason of its refusal; "" if it was not refused."""
 
 
 class KnownAxis(Protocol):
@@ -54,7 +54,7 @@ class KnownAxis(Protocol):
 
 @dataclass(frozen=True)
 class Plant:
-    """One axis as its loops see it.
+    """One axis as controlled by its loops.
 
     Attributes:
         R, L: Resistance [ohm] and inductance [H] of a phase, in the torque-making axis.
@@ -62,13 +62,13 @@ class Plant:
         torque_constant: Torque per ampere of peak i_q [N*m/A].
         inertia: Total inertia at the rotor [kg*m^2].
         viscous: Viscous friction at the rotor [N*m*s/rad].
-        anti_resonance, resonance: Of rotor and load on a shaft that twists [Hz]; infinite if rigid.
+        anti_resonance, resonance: Frequencies of rotor and load on an elastic shaft [Hz]; infinite if rigid.
         damping: Damping ratio of the resonance.
-        delay: What the velocity loop waits besides its current loop and its filter [s]: a period of it, half for the
+        delay: Delay of the velocity loop in addition to current loop and filter [s]: one period, half for the
             difference of counts and half for holding its output.
         velocity_filter: Corner of the velocity filter [Hz].
-        counts: Of the encoder, per turn.
-        emf_constant: Voltage per speed [V*s/rad]; nan for that of a PMSM, torque_constant / 1.5.
+        counts: Encoder counts per turn.
+        emf_constant: Voltage per speed [V*s/rad]; nan: that of a PMSM, torque_constant / 1.5.
 
     Raises:
         ValueError: If a value is impossible for an axis.
@@ -100,12 +100,12 @@ class Plant:
 
     @property
     def is_elastic(self) -> bool:
-        """Whether the load hangs on a spring."""
+        """Whether the load is connected by a spring."""
         return math.isfinite(self.anti_resonance) and math.isfinite(self.resonance)
 
     @property
     def rotor_inertia(self) -> float:
-        """Return the share of the inertia that the spring leaves to the rotor [kg*m^2]; all of it if rigid."""
+        """Return the rotor's part of the inertia [kg*m^2]; all of it if the axis is rigid."""
         return self.inertia * (self.anti_resonance / self.resonance) ** 2 if self.is_elastic else self.inertia
 
     @classmethod
@@ -117,13 +117,13 @@ class Plant:
             motor: The motor.
             supply: Supply voltage [V].
             inertia: Total inertia at the rotor [kg*m^2].
-            more: Fields that are known better.
+            more: Fields that replace these.
         """
         return cls(**_data_sheet(device, motor) | {"supply": supply, "inertia": inertia} | more)
 
     @classmethod
     def from_identification(cls, device: Device, motor: Motor, supply: float, identification: KnownAxis) -> Plant:
-        """Return an axis as identified; refused values are the data sheet's, a refused elastic pair makes it rigid.
+        """Return an axis as identified; refused values are the data sheet's, without an elastic pair it is rigid.
 
         Raises:
             ValueError: If the inertia was refused, since no loop can be computed without one.
@@ -181,7 +181,7 @@ def velocity_open_loop(device: Device, plant: Plant, gains: RawGains, f: ArrayLi
 def velocity_plant(device: Device, plant: Plant, gains: RawGains, f: ArrayLike) -> Complex:
     """Return the plant of the velocity loop: filtered velocity [rad/s] per demanded current [A].
 
-    Of the gains, those of the current loop matter.
+    Only the gains of the current loop matter.
     """
     at = _below(f, device.velocity_rate)
     velocity = mean_velocity(device, plant, gains, at)
@@ -200,18 +200,18 @@ def position_open_loop(device: Device, plant: Plant, gains: RawGains, f: ArrayLi
     at = _below(f, device.velocity_rate)
     z = np.exp(2j * math.pi * at / device.velocity_rate)
     regulator = controllers(device, gains)
-    # What the position loop reads is the angle itself: the differences, added up.
+    # The position loop uses the angle itself: the sum of the differences.
     angle = mean_velocity(device, plant, gains, at) / device.velocity_rate / (1.0 - 1.0 / z)
     inner = regulator.velocity(z) * angle
     return np.asarray(regulator.position * inner / (1.0 + velocity_open_loop(device, plant, gains, at)))
 
 
 def outer_loop(device: Device, plant: Plant, gains: RawGains, f: ArrayLike, velocity: Complex) -> Complex:
-    """Return the open loop of the position loop around a velocity loop that is known, measured or not.
+    """Return the open loop of the position loop around a given velocity loop, measured or computed.
 
     Args:
         device: The drive.
-        plant: The axis; its velocity filter matters, which the position loop does not see.
+        plant: The axis; used is its velocity filter, which is not in the position loop.
         gains: Raw integers in the order of the device's gain set.
         f: Frequencies [Hz], shape (n,).
         velocity: Open loop of the velocity loop there, shape (n,).
@@ -245,7 +245,7 @@ class Controllers(NamedTuple):
 
 
 def controllers(device: Device, gains: RawGains) -> Controllers:
-    """Return raw gains in SI; ValueError for a device whose loops are others than those of this model."""
+    """Return raw gains in SI; ValueError for a device whose loops differ from this model."""
     scales = loop_scales(device)
     return Controllers(*(scales[k].one_value(int(gains[k])) for k in cascade_columns(device)))
 
@@ -274,7 +274,7 @@ def _mean_velocity(rates: LoopRates, P: float, share: float, plant: Plant, frequ
     gains = CascadeGains(P * one, share * one, one, one, one)
     f = np.frombuffer(frequencies)
     result = mean_velocity_of(rates, window(rates, linear(plant), gains), f[None])[0, :, 0, 0]
-    result.setflags(write=False)  # it is handed out to every caller
+    result.setflags(write=False)  # every caller gets the same array
     return np.asarray(result)
 
 
@@ -288,13 +288,13 @@ def linear(plant: Plant) -> LinearMachines:
     )  # fmt: skip
 
 
-_CURRENT, _SPEED = 0, 1  # states
+_CURRENT, _SPEED = 0, 1  # indices of states
 
 
 def _machine(plant: Plant) -> tuple[Floats, Floats]:
-    """Return A, B of the states current, rotor speed, and of an elastic load its twist and its speed; input: voltage.
+    """Return A, B of the states current, rotor speed, and for an elastic load its twist and its speed; input: voltage.
 
-    The rotor's angle is no state: with it the system would have two poles at 0 and no basis of modes.
+    The rotor's angle is not a state: with it the system would have two poles at 0 and no basis of modes.
     """
     emf = plant.torque_constant / 1.5 if math.isnan(plant.emf_constant) else plant.emf_constant
     J = plant.rotor_inertia
@@ -306,7 +306,7 @@ def _machine(plant: Plant) -> tuple[Floats, Floats]:
         load = plant.inertia - J
         stiffness = load * (2.0 * math.pi * plant.anti_resonance) ** 2
         friction = 2.0 * plant.damping * stiffness / (2.0 * math.pi * plant.resonance)
-        # States 2 and 3: angle of the load ahead of the rotor, speed of the load.
+        # States 2 and 3: twist (angle of the load ahead of the rotor), and speed of the load.
         A[1, 2], A[1, 3] = stiffness / J, friction / J
         A[1, 1] -= friction / J
         A[2, 3], A[2, 1] = 1.0, -1.0

@@ -16,12 +16,12 @@ class Margins(NamedTuple):
 
     phase_deg: Least distance from -180 degrees where the gain is 1 [degrees]; negative is unstable.
     gain_db: Least factor, in dB, by which the gain may rise before the loop oscillates; infinite if the phase never
-        reaches -180 degrees with a gain below 1; nan if it may do so with more gain where nothing is trusted; negative
-        is by how much it must fall for the loop to be stable.
+        reaches -180 degrees with a gain below 1; nan if it may do so at frequencies that are not trusted, with more
+        gain; negative: by how much the gain must fall for the loop to be stable.
     crossover_hz: Lowest frequency from which on the gain is below 1 until the next crossing [Hz].
     bandwidth_hz: Frequency at which the closed loop's gain has fallen by 3 dB [Hz].
     ms: Greatest sensitivity |1 / (1 + L)|.
-    phase_hz, gain_hz: Where phase_deg and gain_db are read [Hz]: with a resonance there are several crossings.
+    phase_hz, gain_hz: Frequencies of phase_deg and gain_db [Hz]: with a resonance there are several crossings.
     """
 
     phase_deg: float
@@ -39,7 +39,7 @@ def margins(f: ArrayLike, open_loop: ArrayLike, trusted: ArrayLike | None = None
     Args:
         f: Frequencies [Hz], increasing, shape (n,).
         open_loop: L, complex, shape (n,).
-        trusted: Which frequencies count, shape (n,); what lies between two is looked at if both do.
+        trusted: Which frequencies count, shape (n,); an interval counts if both ends do.
 
     Raises:
         ValueError: For shapes that do not fit, or frequencies that do not increase.
@@ -71,14 +71,14 @@ def margins(f: ArrayLike, open_loop: ArrayLike, trusted: ArrayLike | None = None
     known = np.flatnonzero(good)
     unseen = _unseen(known, log_gain)
     if unseen.size:
-        # The gain passes 1 where nothing is trusted: the phase there is not known, and it may be the worst.
+        # The gain passes 1 between trusted frequencies: the phase there is unknown, and may be the worst.
         phase = phase_at = math.nan
         crossover = math.nan if not crossover < at[known[unseen[0]]] else crossover
     gain, gain_at = _gain_margin(at, log_gain, off, phases)
     left, right = known[:-1], known[1:]
     hidden = (right - left > 1) & (off[left] * off[right] < 0.0) & (np.abs(off[left] - off[right]) < math.pi)
     if hidden.any():
-        # The phase passes -180 degrees where nothing is trusted, and the gain there may be the greater of both ends'.
+        # The phase passes -180 degrees between trusted frequencies; the gain there may be the greater of both ends'.
         worst = -20.0 / math.log(10.0) * float(np.maximum(log_gain[left], log_gain[right])[hidden].max())
         gain, gain_at = (math.nan, math.nan) if worst < gain else (gain, gain_at)
     closed = np.where(good, np.abs(L / (1.0 + L)), math.nan)
@@ -87,16 +87,16 @@ def margins(f: ArrayLike, open_loop: ArrayLike, trusted: ArrayLike | None = None
 
 
 def is_as_stable(before: Complex, now: Complex) -> Mask:
-    """Return whether closed loops are as stable with one open loop as with another, (..., n): (...).
+    """Return whether closed loops are as stable with one open loop as with another, shape (...) of (..., n).
 
-    They are if 1 + L turns round 0 as often.
+    They are if 1 + L encircles 0 as often.
     """
     turned = np.unwrap(np.angle((1.0 + now) / (1.0 + before)), axis=-1)
     return np.asarray(np.abs(turned[..., -1] - turned[..., 0]) < math.pi)
 
 
 def _unseen(known: Integers, log_gain: Floats) -> Integers:
-    """Return after which of the trusted frequencies others follow among which the gain passes 1."""
+    """Return the trusted frequencies that are followed by untrusted ones in which the gain passes 1."""
     return np.flatnonzero((np.diff(known) > 1) & (np.diff(np.sign(log_gain[known])) != 0.0))
 
 
@@ -108,7 +108,7 @@ def _crossings(f: Floats, value: Floats, where: Mask) -> Floats:
 
 
 def _gain_margin(f: Floats, log_gain: Floats, off: Floats, phases: Floats) -> tuple[float, float]:
-    """Return the gain margin [dB] and where it is read [Hz], of crossings of -180 degrees at `phases` [Hz]."""
+    """Return the gain margin [dB] and its frequency [Hz], from the crossings of -180 degrees at `phases` [Hz]."""
     if not phases.size:
         return math.inf, math.nan
     margin = -20.0 / math.log(10.0) * np.interp(np.log(phases), np.log(f), log_gain)

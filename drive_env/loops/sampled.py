@@ -1,9 +1,9 @@
-"""Machines as the loops of their drives sample them, many side by side and with any number of axes each.
+"""Machines as sampled by the loops of their drives: many at once, with any number of axes each.
 
 Currents, speeds and twists of a machine are one linear system in continuous time. The current loops sample it every
-tick, compute duties that act during the next one, and repeat that as often as ticks make a window; the velocity and
-position loops see it once a window. Of a machine with several axes each loop is judged with the loops of the other axes
-closed. Left out are limits, friction, quantisation, noise, and what the d axis does.
+tick and compute duties that act during the next one; the velocity and position loops sample it once per window of
+several ticks. In a machine with several axes each loop is evaluated with the loops of the other axes closed. Limits,
+friction, quantisation, noise, and the d axis are neglected.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 
 
 RIGID = 1e-6  # a mode whose squared frequency is below this share of the greatest is rigid motion
-_TERMS = 14  # of Taylor's series of exp(X), |X| <= 1/2: 2e-17 are left
+_TERMS = 14  # of Taylor's series of exp(X), |X| <= 1/2: the error is 2e-17
 
 
 class LoopRates(NamedTuple):
-    """How often a drive's loops run, and how often its master speaks [Hz]."""
+    """Rates of a drive's loops, and of its master's cycles [Hz]."""
 
     current_rate: float
     velocity_rate: float
@@ -33,15 +33,18 @@ class LoopRates(NamedTuple):
 
     @classmethod
     def of(cls, device: Device) -> LoopRates:
-        """Return those of a device."""
+        """Return the rates of a device."""
         return cls(device.current_rate, device.velocity_rate, device.communication_rate)
 
 
 class LinearMachines(NamedTuple):
     """Machines in continuous time: dx/dt = A x + B u, with the voltages u of the axes [V].
 
-    A: (machines, states, states). B: (machines, states, axes). current, speed: What of the states is the current [A]
-    and the speed of each rotor [rad/s], (machines, axes, states). supply: Of each axis [V], (machines, axes).
+    A: (machines, states, states).
+    B: (machines, states, axes).
+    current, speed: Rows that give the current [A] and speed [rad/s] of each rotor from the states,
+        (machines, axes, states).
+    supply: Supply voltage of each axis [V], (machines, axes).
     velocity_filter: Corner of each axis's velocity filter [Hz], (machines, axes).
     """
 
@@ -54,10 +57,10 @@ class LinearMachines(NamedTuple):
 
 
 class Windings(NamedTuple):
-    """The motors of machines, (machines, axes) each: as `LinearMachines` has supply and velocity filter.
+    """The motors of machines, (machines, axes) each; supply and velocity filter as in `LinearMachines`.
 
-    R, L: Of a phase, in the torque-making axis [ohm], [H]. emf: Voltage per speed [V*s/rad].
-    torque: Per current [N*m/A].
+    R, L: Resistance and inductance of a phase, in the torque-making axis [ohm], [H]. emf: Voltage per speed [V*s/rad].
+    torque: Torque per current [N*m/A].
     """
 
     R: Floats
@@ -72,14 +75,14 @@ def linear_machines(windings: Windings, M: Floats, D: Floats, K: Floats, rotors:
     """Return machines from the matrices of their loads: M q'' + D q' + K q = torque.
 
     Args:
-        windings: Of their motors.
+        windings: Their motors.
         M: Inertia, (machines, joints, joints).
         D: Damping, likewise.
         K: Stiffness, likewise.
-        rotors: What each rotor turns by joint, (axes, joints).
+        rotors: Joint coordinates of each rotor's angle, (axes, joints).
     """
     (count, joints), axes = M.shape[:2], len(rotors)
-    # What springs hold are the twists along the eigenvectors of K; what turns freely is no state of an angle.
+    # Springs hold the twists along the eigenvectors of K; the angle of a free rotation is not a state.
     squares, twists = np.linalg.eigh(K)
     elastic = squares.max(axis=0) > RIGID * max(float(squares.max()), 1e-300)
     squares, twists = squares[:, elastic], twists[:, :, elastic]
@@ -133,7 +136,7 @@ class LoopWindow(NamedTuple):
 
 
 def held(A: Floats, B: Floats, speed: Floats, T: float) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return Phi, Gamma of systems whose inputs are held for T [s], and the rotors' angle meanwhile, likewise."""
+    """Return Phi, Gamma of systems whose inputs are held for T [s], and likewise for the rotors' turns."""
     machines, states, axes = B.shape
     size = states + 2 * axes
     block = np.zeros((machines, size, size))
@@ -150,7 +153,7 @@ def held(A: Floats, B: Floats, speed: Floats, T: float) -> tuple[Floats, Floats,
 def exponential(X: Floats) -> Floats:
     """Return exp(X) of small matrices, (..., n, n), to rounding: Taylor's series of X / 2^k, squared k times.
 
-    SciPy's takes 20 ms instead of 0.1 where cores are busy, for its threads; a fit needs hundreds.
+    On busy cores SciPy's takes 20 ms instead of 0.1 because of its threads; a fit needs hundreds.
     """
     norm = float(np.abs(X).sum(axis=-2).max())
     halvings = max(0, math.ceil(math.log2(norm)) + 1) if norm > 0.0 else 0
@@ -169,7 +172,7 @@ def window(rates: LoopRates, machines: LinearMachines, gains: CascadeGains) -> L
     Phi, Gamma, of_state, of_voltage = held(A, B, speed, 1.0 / rates.current_rate)
     count, states, axes = B.shape
     size, one = states + 2 * axes, np.arange(axes)
-    # States: the machine's, the voltages that are computed and not yet applied, the regulators' integrals.
+    # States: the machine's, the computed but not yet applied voltages, the regulators' integrals.
     pending, integral = states + one, states + axes + one
     P, share = gains.current_p, gains.current_i
     tick, drive = np.zeros((count, size, size)), np.zeros((count, size, axes))
@@ -213,7 +216,7 @@ def mean_velocity(rates: LoopRates, one: LoopWindow, f: Floats) -> Complex:
     """Return the mean velocity of rotors over a window [rad/s] per demanded current [A], (machines, n, axes, axes).
 
     Args:
-        rates: Of the drive.
+        rates: The drive's rates.
         one: The window.
         f: Frequencies [Hz], (machines, n).
     """
@@ -235,7 +238,7 @@ def open_loops(
     """Return the open outer loops of machines, for each axis with all loops of the others closed.
 
     Args:
-        rates: Of the drive.
+        rates: The drive's rates.
         machines: The machines.
         gains: Their gains.
         f: Frequencies [Hz] above 0 and below half the velocity loop's rate, (machines, n).
@@ -246,13 +249,13 @@ def open_loops(
 
 
 def loops_around(rates: LoopRates, plant: Complex, corner: Floats, gains: CascadeGains, f: Floats) -> OuterLoops:
-    """Return the open outer loops around machines whose current loops are closed; arguments as `open_loops` has them.
+    """Return the open outer loops around machines whose current loops are closed; arguments as for `open_loops`.
 
     Args:
-        rates: Of the drive.
-        plant: What `mean_velocity` returns of the machines.
-        corner: Of each axis's velocity filter [Hz], (machines, axes).
-        gains: Of the outer loops.
+        rates: The drive's rates.
+        plant: Result of `mean_velocity` for the machines.
+        corner: Corner of each axis's velocity filter [Hz], (machines, axes).
+        gains: Gains of the outer loops.
         f: Frequencies of the plant [Hz], (machines, n).
     """
     from drive_env.emulator.parameters import velocity_filter
@@ -276,7 +279,7 @@ def loops_around(rates: LoopRates, plant: Complex, corner: Floats, gains: Cascad
 
 
 class ClosedLoops(NamedTuple):
-    """Machines with all loops closed, once a window: x' = A x + B r, angles = C x; r: demanded angles [rad]."""
+    """Machines with all loops closed, sampled once a window: x' = A x + B r, angles = C x; r: demanded angles [rad]."""
 
     A: Floats
     B: Floats
@@ -284,7 +287,7 @@ class ClosedLoops(NamedTuple):
 
     @property
     def growth(self) -> Floats:
-        """How fast the fastest growing motion grows [1/s], (machines,); at most 0 if none does."""
+        """Rate of the fastest growing motion [1/s], (machines,); at most 0 if none grows."""
         radius = np.abs(np.linalg.eigvals(self.A)).max(axis=-1)
         return np.asarray(np.log(np.maximum(radius, 1e-300)))
 
@@ -295,7 +298,7 @@ def closed_loops(rates: LoopRates, machines: LinearMachines, gains: CascadeGains
 
     rate, (count, size, axes) = rates.velocity_rate, one.H.shape
     b, a1, a2 = velocity_filter(machines.velocity_filter, rate)
-    # States: the window's, mean velocity of the one before, two of the filter, integral of the error, angle before.
+    # States: the window's, the previous mean velocity, two of the filter, integral of the error, previous angle.
     at = [slice(size + k * axes, size + (k + 1) * axes) for k in range(5)]
     mean, first, second, total, angle = at
     whole, eye = size + 5 * axes, np.eye(axes)
@@ -330,17 +333,17 @@ def closed_loops(rates: LoopRates, machines: LinearMachines, gains: CascadeGains
 def step_overshoot(
     rates: LoopRates, closed: ClosedLoops, duration: float = 0.3, growth: Floats | None = None
 ) -> Floats:
-    """Return how far each axis goes beyond a step of its set-point in csp, over the step, (machines, axes).
+    """Return the overshoot of each axis after a step of its set-point in csp, over the step, (machines, axes).
 
     The larger of two steps counts: of its own set-point alone, and of all axes together, as a gantry moves, whose
-    bridge otherwise holds each axis at the other one. The set-point moves there within a communication cycle, as csp
-    interpolates it, and the angle is looked at once a cycle. Of an unstable machine it is infinite.
+    bridge otherwise holds each axis at the other one. The set-point moves there within a communication cycle, as
+    interpolated by csp, and the angle is sampled once per cycle. For an unstable machine the overshoot is infinite.
 
     Args:
-        rates: Of the drive.
+        rates: The drive's rates.
         closed: The machines.
-        duration: How long it is looked at [s].
-        growth: That of `closed`, computed by default.
+        duration: Time to evaluate [s].
+        growth: `closed.growth`, computed by default.
     """
     cycle = round(rates.velocity_rate / rates.communication_rate)
     (count, states, axes), cycles = closed.B.shape, round(duration * rates.communication_rate)
@@ -349,7 +352,7 @@ def step_overshoot(
         ramp = closed.A @ ramp + closed.B * (k + 1) / cycle
         constant = closed.A @ constant + closed.B
         A = closed.A @ A
-    # With the set-points as states, and each look at the angles for as many cycles again as there are looks.
+    # The set-points are states; each doubling covers as many cycles again as are computed already.
     size, unit = states + axes, np.broadcast_to(np.eye(axes), (count, axes, axes))
     ahead = np.zeros((count, size, size))
     ahead[:, :states, :states], ahead[:, :states, states:], ahead[:, states:, states:] = A, constant, unit
@@ -357,11 +360,11 @@ def step_overshoot(
     with np.errstate(over="ignore", invalid="ignore"):
         while looks.shape[1] < cycles * axes:
             looks, ahead = np.concatenate([looks, looks @ ahead], axis=1), ahead @ ahead
-        # By cycle, axis that moves and axis whose set-point does.
+        # By cycle, axis that moves, and axis whose set-point steps.
         moved = (looks[:, : cycles * axes] @ np.concatenate([ramp, unit], axis=1)).reshape(count, cycles, axes, axes)
         most = np.fmax(np.einsum("mkaa->mka", moved), moved.sum(axis=-1)).max(axis=1)
     stable = (closed.growth if growth is None else growth)[:, None] <= STILL
     return np.where(stable & np.isfinite(most), np.maximum(most - 1.0, 0.0), np.inf)
 
 
-STILL = 1e-7  # per window: what grows by less stands still
+STILL = 1e-7  # per window: a motion that grows by less stands still

@@ -1,6 +1,6 @@
-"""Emulated machines, linearised where their loads start: the truth that scores and tests measure by.
+"""Emulated machines, linearised where their loads start: the true plant for scores and tests.
 
-Flanks that transmit count as pressed, dry friction and gravity as none.
+Backlash is taken as closed; dry friction and gravity are neglected.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def terminal_resistance(parameters: Mapping[str, Any], kind: str) -> Any:
-    """Return the resistance that a drive sees [ohm]: of one phase of the winding, with that of the stage in its path.
+    """Return the resistance seen by a drive [ohm]: one phase of the winding and the stage in its path.
 
     A brushed motor's current flows through both legs of its bridge.
     """
@@ -52,7 +52,7 @@ def linear_load(load: PackedLoad) -> LinearLoad:
 
 
 def true_machines(drives: Drives) -> LinearMachines:
-    """Return emulated machines with all that they move, each with all its axes.
+    """Return emulated machines with their loads, each with all its axes.
 
     Raises:
         ValueError: For drives on a bus, whose true parameters are unknown.
@@ -78,7 +78,7 @@ def true_machines(drives: Drives) -> LinearMachines:
 
 
 def elastic_lags(drives: Drives) -> Floats:
-    """Return each axis' delay by the springs of emulated machines [s], (machines, axes); 0 for a rigid axis.
+    """Return each axis' delay due to the springs of emulated machines [s], (machines, axes); 0 for a rigid axis.
 
     While a rotor accelerates by a and the others stand, the parts on its springs are twisted behind it: the square of
     the delay is the energy of the twist over that of the motion. On one spring it is the square root of the load's
@@ -88,7 +88,7 @@ def elastic_lags(drives: Drives) -> Floats:
     for group in emulated_of(drives).inside.groups:
         M, _, K, rotors = linear_load(group.load)
         one = np.linalg.pinv(rotors)  # each rotor turned by 1, (joints, axes)
-        free = np.linalg.svd(rotors)[2][len(rotors) :].T  # how joints may move while all rotors stand
+        free = np.linalg.svd(rotors)[2][len(rotors) :].T  # motions of joints while all rotors stand
         soft = np.linalg.pinv(free.T @ K @ free, rcond=RIGID, hermitian=True)
         moved = one - free @ (soft @ (free.T @ K @ one))
         pushed = free.T @ M @ moved

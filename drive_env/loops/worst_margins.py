@@ -1,4 +1,4 @@
-"""The margins of machines as their drives' loops sample them: of each the worst outer loop."""
+"""Margins of machines as sampled by their drives' loops: the worst outer loop of each."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from drive_env.loops.margins import margins
 from drive_env.loops.sampled import STILL, CascadeGains, LinearMachines, LoopRates, closed_loops, open_loops, window
 from mechanics.arrays import Floats
 
-UNSTABLE_MS = 100.0  # Ms of unstable loops, and the greatest there is
+UNSTABLE_MS = 100.0  # Ms of unstable loops, and its upper limit
 LOWEST, HIGHEST, POINTS = 0.02, 0.49, 4000  # frequencies: from [Hz], up to of the velocity loop's rate, how many
 
 
 class WorstMargins(NamedTuple):
     """Phase margin [degrees], gain margin [dB] and Ms of each machine's outer loops, the worst of each, (machines,).
 
-    Of a stable machine the phase is the least distance from -180 degrees, to either side; of an unstable one they are
-    0, 0 and 100. Gain is how far it may rise; how far it may fall is not among them.
+    For a stable machine the phase margin is the least distance from -180 degrees to either side; for an unstable one
+    the values are 0, 0 and 100. The gain margin is that for a rising gain only.
     """
 
     phase_deg: Floats
@@ -27,7 +27,7 @@ class WorstMargins(NamedTuple):
 
 
 def worst_margins(rates: LoopRates, machines: LinearMachines, gains: CascadeGains) -> WorstMargins:
-    """Return the margins of machines; of one with several axes the worst of all axes, the others' loops closed."""
+    """Return the margins of machines; for several axes the worst axis, with the others' loops closed."""
     one = window(rates, machines, gains)
     f = np.geomspace(LOWEST, HIGHEST * rates.velocity_rate, POINTS)
     loops = open_loops(rates, machines, gains, np.tile(f, (len(machines.A), 1)), one)

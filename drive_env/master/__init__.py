@@ -1,1 +1,1 @@
-"""The master's side of a fieldbus: drives over a link, and CAN, which is one. It knows EDS files, not the slave."""
+"""The master's side of a fieldbus: drives over a link (CAN or EtherCAT). It knows EDS files, not the slave's code."""

@@ -1,6 +1,6 @@
 """Objects that no process data carry, read by SDO while cycles pass: each row has the value that was read last.
 
-For states alone, which change seldom: of a position a row would be wrong by what is some milliseconds old.
+Only for states, which change seldom: a position would be wrong, since its value is some milliseconds old.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ class AskedRows:
 
     Args:
         entries: The objects.
-        read: Returns one of every axis.
-        passed: Returns how many rows there are by now.
+        read: Reads one object of every axis.
+        passed: Returns the number of rows so far.
     """
 
     def __init__(self, entries: Sequence[Entry], read: Callable[[Entry], Integers], passed: Callable[[], int]) -> None:
@@ -40,17 +40,17 @@ class AskedRows:
     def _run(self) -> None:
         try:
             while not self._told or not self._is_over.wait(PAUSE):
-                # What comes belongs to the row that is next when it is there.
+                # A value belongs to the first row that is not yet complete when it arrives.
                 values = [self._read(entry) for entry in self._entries]
                 self._told.append((self._passed(), values))
-        except BaseException as error:  # raised where the rows are waited for
+        except BaseException as error:  # raised in `rows`
             self._error = error
 
     def rows(self, count: int) -> dict[Key, Integers]:
         """Return each object of shape (count, num_axes); raises the error that ended the reads."""
         if self._error is not None:
             raise self._error
-        # The first answer stands for the rows before it, too.
+        # The first value is also used for the rows before it.
         begins = np.minimum([0, *(row for row, _ in self._told[1:])], count)
         times = np.diff(begins, append=count)
         return {

@@ -1,8 +1,8 @@
-"""Drives on a fieldbus behind the Drives interface, whatever links them: real ones, or emulated ones that are served.
+"""Drives on a fieldbus behind the Drives interface, over any link: real drives, or served emulated ones.
 
-`read` and `write` are SDO transfers, always: a mapped object's last sample is a cycle old, and what is written in
-process data acts at the next SYNC only, so that a program would see other integers than on `EmulatedDrives`. `record`
-samples and plays in process data, which it maps as needed.
+`read` and `write` are always SDO transfers: a mapped object's last sample is a cycle old, and a value in process data
+acts only at the next SYNC, so a program would see other integers than on `EmulatedDrives`. `record` samples and plays
+in process data, which it maps as needed.
 """
 
 from __future__ import annotations
@@ -54,20 +54,20 @@ class BusDrives:
     """Drives on a link, with the interface of `EmulatedDrives`: the same calls, the same integers.
 
     Axes are those of the first node, then those of the second, and so on. Nodes are started when process data or a
-    safeguard need it; process data and watchdogs are put back as they were by `close`.
+    watchdog need it; `close` restores process data and watchdogs.
 
     Args:
-        link: The nodes, all of one device; it is closed by `close`, and where this fails.
-        description: What device they are.
+        link: The nodes, all of one device; closed by `close`, and if the constructor fails.
+        description: Their device.
         pace: When communication cycles are due.
-        safety: Limits; False for none at all, which is for emulators.
+        safety: Limits; False: no limits, which is for emulators.
 
     Raises:
         BusError: If a node does not answer or is another device.
         ValueError: For limits that do not fit the number of axes.
     """
 
-    machine = None  # of the Drives interface: what emulated drives alone have
+    machine = None  # of the Drives interface: only emulated drives have one
     observers = ()
 
     def __init__(self, link: Link, description: Description, pace: Pace, safety: Limits | bool = True) -> None:
@@ -94,7 +94,7 @@ class BusDrives:
         except BaseException:
             link.close()
             raise
-        # Without `with`, an exception ends the interpreter through here, and the drives must not go on alone.
+        # Without `with`, an exception ends the interpreter through here; the drives must not go on alone.
         atexit.register(self.close)
 
     # --- the interface --------------------------------------------------------------------------------------------
@@ -113,7 +113,7 @@ class BusDrives:
         self._enter()
         known = self._description.dictionary
         scale = position_scale(known.roles) if name is Role.POSITION_SCALE else None
-        if scale is not None and len(scale.keys) > 1:  # no object has it: several make it
+        if scale is not None and len(scale.keys) > 1:  # no single object has it: several form it
             made = scale.increments([self.read_entry(known.find(key), axes).astype(float) for key in scale.keys])
             return np.asarray(np.rint(made), np.int64)
         values: Integers = self.read_entry(known.find(name), axes)
@@ -122,12 +122,12 @@ class BusDrives:
     def write(self, name: ObjectName, value: ArrayLike, where: Mask | None = None) -> None:
         """Write an object of the axes where the mask is true: one integer, one per axis, or a quantity, "500 rpm".
 
-        Type, access and range are checked before anything is sent. What only a drive can tell it tells one axis after
-        the other: those before the one that refuses keep the new value.
+        Type, access and range are checked before anything is sent. What only a drive can check is checked axis by axis:
+        axes before the one that refuses keep the new value.
 
         Raises:
             ObjectAccessError: With the SDO abort code, if the object, the value or the state does not allow it.
-            SafetyError: If a limit does not; NoAnswerError if a node is silent.
+            SafetyError: If a limit does not allow it; NoAnswerError if a node is silent.
             ValueError: For a quantity of another kind than the object's.
         """
         self._enter()
@@ -160,11 +160,11 @@ class BusDrives:
     def advance(self, duration: float) -> None:
         """Let `duration` [s] pass, whole communication cycles, with a SYNC in each.
 
-        Where SYNCs come less often (`CanDrives(cycle=...)`) it is rounded up to whole times between two. In real time
-        the duration is kept: where this computer was late, SYNCs are left out.
+        With a longer time between SYNCs (`CanDrives(cycle=...)`) it is rounded up to a whole multiple of that. In real
+        time the duration is kept: SYNCs for which this computer was too late are left out.
 
         Raises:
-            SafetyError: If a limit is passed meanwhile; the drives are in quick stop then.
+            SafetyError: If a limit is passed; the drives are in quick stop then.
         """
         self._enter()
         per_sync = self._description.cycles_per_sync
@@ -176,9 +176,9 @@ class BusDrives:
     def record(self, objects: ObjectNames, duration: float, play: Rows = None, period: float = 0.001) -> Trace:
         """Let `duration` [s] pass while objects are recorded and played.
 
-        Cycle k: row k of `play` goes out, then SYNC, at which the drives take it and sample row k of `objects`, which
-        comes back. Objects of the last call stay mapped: a call with the same ones costs no configuration, so a policy
-        may record and play cycle by cycle.
+        In cycle k row k of `play` is sent, then SYNC, at which the drives apply it and sample row k of `objects`.
+        Objects of the last call stay mapped: a call with the same ones costs no configuration, so a policy may record
+        and play cycle by cycle.
 
         Args:
             objects: What to record: one object, or several; objects that the drive can map to process data.
@@ -188,9 +188,9 @@ class BusDrives:
 
         Raises:
             ObjectAccessError: For an object that cannot be mapped, for more than fit, or a value out of range.
-            ValueError: For times that are no whole cycles, or rows that do not fit.
+            ValueError: For times that are not whole cycles, or rows of a wrong shape.
             SafetyError: If a limit is passed; the drives are in quick stop then.
-            NoAnswerError: If samples stay out.
+            NoAnswerError: If samples do not come.
         """
         self._enter()
         cycles, every = self._cycles(duration), self._cycles(period)
@@ -210,15 +210,15 @@ class BusDrives:
         return Trace(times, values, self._description.dictionary, self._scales)
 
     def can_record(self, objects: Sequence[ObjectName]) -> bool:
-        """Return whether objects can be recorded together; nothing is mapped for it."""
+        """Return whether objects can be recorded together; maps nothing."""
         self._enter()
         return self._cycle_runner.can_record(objects)
 
     def emergencies(self) -> list[EmergencyMessage]:
         """Return and forget the emergency messages since the last call, axis by axis in the order of each axis.
 
-        Of a node with several axes that does not tell which one sent an emergency, the first one stands for it; what
-        stops the whole module, and is told once, is told of each of its axes.
+        If a node with several axes does not report which one sent an emergency, it is attributed to the first axis; an
+        emergency that stops the whole module, sent once, is returned for each of its axes.
         """
         self._enter()
         if self._pace.time_waits:
@@ -253,18 +253,18 @@ class BusDrives:
             self.safety.after_reset(chosen)
 
     def close(self) -> None:
-        """Stop axes that still run, put process data and watchdogs back, and close the bus, which ends its use."""
+        """Stop axes that still run, restore process data and watchdogs, and close the bus, which ends its use."""
         if self._closed:
             return
         if self.safety is not None:
-            self.safety.close()  # if something ends this, close can be called again, and is at the interpreter's end
-        with held_signals() as noted:  # between two of its PDOs a drive has neither ours nor its own
+            self.safety.close()  # if interrupted here, close can be called again, as it is at the interpreter's end
+        with held_signals() as noted:  # between two of its PDOs' changes a drive has neither our mapping nor its own
             self._closed = True
             atexit.unregister(self.close)
             try:
                 for k, node in enumerate(self.nodes):
                     if self.safety is not None and self.safety.has_lost(k):
-                        continue  # it is left to its watchdog: what it hears is what it heard
+                        continue  # it is left to its watchdog and must receive nothing more
                     with _logged(f"the PDOs of node {node} stay as they are"):
                         self._link.process.restore(k)
             finally:
@@ -284,17 +284,17 @@ class BusDrives:
 
     @property
     def bus(self) -> BusDrives:
-        """These drives, where others have to do with a bus."""
+        """Itself: the drives of a bus."""
         return self
 
     @property
     def timing(self) -> Timing:
-        """How punctual the SYNCs of the last `advance` or `record` were."""
+        """Punctuality of the SYNCs of the last `advance` or `record`."""
         return self._pace.timing
 
     @property
     def total_timing(self) -> Timing:
-        """How punctual all SYNCs were since the drives were opened."""
+        """Punctuality of all SYNCs since the drives were opened."""
         return self._pace.total
 
     # --- what the envelope and the tools use ----------------------------------------------------------------------
@@ -318,13 +318,13 @@ class BusDrives:
         return self._link.sdo(node)
 
     def write_raw(self, entry: Entry, axis: int, value: int) -> None:
-        """Write an object of one axis, past lent values."""
+        """Write an object of one axis, regardless of a lent value."""
         node, index, sub, label = self._place_of(entry, axis)
         data = self._description.encode(entry, value)
         self._link.sdo(node).write(index, sub, data, f"{value} to {label}", self._description.patience(entry))
 
     def read_raw(self, entry: Entry, axis: int) -> Any:
-        """Read an object of one axis as the drive has it, also where that is lent."""
+        """Read an object of one axis as the drive has it, even if that value is lent."""
         node, index, sub, label = self._place_of(entry, axis)
         data = self._link.sdo(node).read(index, sub, label, self._description.patience(entry))
         return self._description.decode(entry, data)
@@ -339,7 +339,7 @@ class BusDrives:
         self._started = False
 
     def prepare_watch(self, watch: CycleWatch) -> None:
-        """Have mapped what an envelope watches."""
+        """Have the objects mapped that an envelope watches."""
         self._cycle_runner.prepare(watch)
 
     def sampled_entries(self) -> tuple[Entry, ...]:
@@ -347,7 +347,7 @@ class BusDrives:
         return self._cycle_runner.mapped()
 
     def poll(self, watch: CycleWatch) -> bool | None:
-        """Look at the drives by a SYNC of one's own, as `CycleRunner.poll`."""
+        """Send a SYNC and observe its samples, as `CycleRunner.poll`."""
         return self._cycle_runner.poll(watch)
 
     @property
@@ -356,13 +356,13 @@ class BusDrives:
         return self._link.is_dry
 
     def start(self) -> None:
-        """Take the nodes to where they exchange process data, once."""
+        """Make the nodes operational, so that they exchange process data; once."""
         if not self._started:
             self._link.start()
             self._started = True
 
     def read_entry(self, entry: Entry, axes: Sequence[int] | None = None) -> Any:
-        """Read an object of every axis, or of some, without being watched."""
+        """Read an object of every axis, or of some, past the envelope."""
         entry = self._description.shown_by(entry)
         check_readable(entry)
         values = [self.read_axis(entry, axis) for axis in (range(self.num_axes) if axes is None else axes)]
@@ -371,12 +371,12 @@ class BusDrives:
         return np.array(values, np.int64 if entry.high is None or entry.high < 2**63 else np.uint64)
 
     def read_axis(self, entry: Entry, axis: int) -> Any:
-        """Read an object of one axis; of one that has another value meanwhile (`Limits`) the program's own."""
+        """Read an object of one axis; if another value is lent (`Limits`), the program's own."""
         found = self.read_raw(entry, axis)
         return found if self.safety is None or not isinstance(found, int) else self.safety.own(entry, axis, found)
 
     def write_axis(self, entry: Entry, axis: int, value: int | str) -> None:
-        """Write an object of one axis without being watched."""
+        """Write an object of one axis, past the envelope."""
         if isinstance(value, str):
             node, index, sub, label = self._place_of(entry, axis)
             data = self._description.encode(entry, value)
@@ -385,7 +385,7 @@ class BusDrives:
             self.write_raw(entry, axis, value)
 
     def pass_cycle(self) -> None:
-        """Let one cycle pass without being watched."""
+        """Let one cycle pass, past the envelope."""
         run_cycles(self._link, self._pace, 1, None, None, self._description.answer_timeout)
         self._pace.end(self._link.receive)
         if self._pace.time_waits:
@@ -393,21 +393,21 @@ class BusDrives:
 
     # --- inside ---------------------------------------------------------------------------------------------------
     def _scales(self) -> list[Scale]:
-        """Read the scale of every axis' units, as far as the drive tells it."""
+        """Read the scale of every axis' units, as far as the drive reports it."""
         return scales_of(self, self._description.dictionary)
 
     def _place_of(self, entry: Entry, axis: int) -> tuple[int, int, int, str]:
-        """Return the node of an axis by its position, and index, sub-index and label of an object there."""
+        """Return an axis' node (by position), and index, sub-index and label of an object there."""
         node, part = divmod(axis, self._description.num_axes)
         return node, *self._description.key(entry, part), self._description.label(entry, part)
 
     def _addressed(self, entry: Entry, axis: int, value: int) -> tuple[int, Key, bytes]:
-        """Return the node of an axis by its position, an object there, and its value as bytes."""
+        """Return an axis' node (by position), an object's key there, and its value as bytes."""
         node, index, sub, _ = self._place_of(entry, axis)
         return node, (index, sub), self._description.encode(entry, value)
 
     def _greet(self) -> None:
-        """Check that every node is there and is the device it is taken for."""
+        """Check that every node answers and is the device that it was opened as."""
         known = self._description.dictionary
         for k, node in enumerate(self.nodes):
             axis = k * self._description.num_axes
@@ -426,7 +426,7 @@ class BusDrives:
             self._link.welcome(k)
 
     def _who_it_is(self, kind: int, axis: int) -> str:
-        """Return the advice for a message: as which device, or with which EDS, this node should be opened."""
+        """Return the advice for a message: as which device, or with which EDS, to open this node."""
         vendor, product = (self.read_axis(self._description.dictionary.find(key), axis) for key in list(_IDENTITY)[:2])
         other = device_of(kind, vendor, product)
         if other is None:
@@ -447,7 +447,7 @@ class BusDrives:
             )
 
     def _wake(self, k: int) -> int:
-        """Have a node answer, and return its 1000h; one that is stopped, as it is after a master died, is woken."""
+        """Return a node's 1000h; a node that is stopped, say since its master died, is woken first."""
         entry, axis = self._description.dictionary.find(_DEVICE_TYPE), k * self._description.num_axes
         try:
             return int(self.read_axis(entry, axis))
@@ -472,7 +472,7 @@ class BusDrives:
             self.safety.alive()
 
     def _catch_up(self) -> None:
-        """Return when an emulator in lockstep has simulated every SYNC: it answers in order."""
+        """Wait until an emulator in lockstep has simulated every SYNC: it answers in order."""
         self.read_axis(self._description.dictionary.find(_DEVICE_TYPE), 0)
 
     def _cycles(self, duration: float) -> int:
@@ -480,15 +480,15 @@ class BusDrives:
 
 
 def checked_limits(safety: Limits | bool) -> Limits | None:
-    """Return the limits in force, None for no envelope; TypeError for a value of another type."""
-    if not isinstance(safety, bool | Limits):  # None, say, must not quietly mean that there is no envelope
+    """Return the limits in force; None if `safety` is False. TypeError for a value of another type."""
+    if not isinstance(safety, bool | Limits):  # say, None must not silently mean "no envelope"
         raise TypeError(f"safety = {safety!r} must be Limits, True for those of the drives, or False for an emulator")
     return (Limits() if safety is True else safety) or None
 
 
 @contextlib.contextmanager
 def _logged(consequence: str) -> Any:
-    """Log a failure to tidy up, and go on: the other steps must be tried, too."""
+    """Log a failure to tidy up, and continue: the other steps must be tried, too."""
     try:
         yield
     except (BusError, ObjectAccessError) as error:

@@ -21,39 +21,40 @@ from drive_env.master.can.port import Port, open_bus
 from drive_env.master.can.sdo import SdoClient
 from drive_env.master.pace import LockstepPace, Pace, RealTimePace, cycles_per_sync
 
-TWIN_TIME = 0.005  # s by which a second node with the same node-ID may answer later: they are of one kind
+TWIN_TIME = 0.005  # s by which a second node with the same node-ID may answer later: both are of one kind
 
 
 class CanDrives(BusDrives):
     """Drives on a CAN bus, with the interface of `EmulatedDrives`: the same calls, the same integers.
 
     Axes are those of the first node, then those of the second, and so on. Nodes are started (NMT) when PDOs or a
-    safeguard need it; PDO mapping and error control are put back as they were by `close`. `record` samples in
-    synchronous TPDOs and plays in synchronous RPDOs, or in others if a drive has none. PDOs of further axes that have
-    no identifier borrow those of the node-IDs above (`borrowed_identifiers.py`).
+    watchdog need it; `close` restores PDO mapping and error control. `record` samples in synchronous TPDOs and plays in
+    synchronous RPDOs, or in others if a drive has none. PDOs of further axes without an identifier borrow those of the
+    node-IDs above (`borrowed_identifiers.py`).
 
     Args:
         device: Name of a known device; ignored with `eds`.
         eds: EDS of any other CiA 402 drive; cp1252 files are read, too.
-        interface: As python-can names it; from DRIVE_ENV_INTERFACE if not given.
+        interface: The name in python-can; from DRIVE_ENV_INTERFACE if not given.
         channel: The channel, e.g. "can0" or "socket://127.0.0.1:PORT"; from DRIVE_ENV_CHANNEL if not given.
         nodes: Node-IDs, all of this device.
-        pace: "real-time": time passes by the clock, one SYNC per communication cycle. "lockstep": time passes by
-            SYNC, for an emulator served so.
-        cycle: Time between two SYNCs in real time [s]: whole communication cycles of the drives, one by default. What
-            many axes exchange takes a longer one: frames that do not fit into a cycle are refused. Write 60C2h to it
-            for csp and csv; `advance` lets whole ones pass, and `record` takes such a `period`.
+        pace: "real-time": time passes by the clock, one SYNC per communication cycle. "lockstep": time passes by SYNC,
+            for an emulator served with --lockstep.
+        cycle: Time between two SYNCs in real time [s]: whole communication cycles of the drives, one by default. Many
+            axes need a longer one: frames that do not fit into it are refused. Set 60C2h to it for csp and csv;
+            durations of `advance` and `period` of `record` are multiples of it.
         bus: An open python-can bus in place of interface and channel; it stays open afterwards.
         timeout: Longest wait for an answer [s]; the device's own by default.
-        timeouts: Object -> time-out [s], for those that need another.
-        safety: Limits; False for none at all, which is for emulators.
+        timeouts: Object -> time-out [s], for objects that need another.
+        safety: Limits; False: no limits, which is for emulators.
         dry_run: Print frames and send none: answers are the dictionary's defaults. A function takes the lines instead.
-        options: Whatever the interface takes besides, e.g. `bitrate=1_000_000`; `token` for a hub that asks for one
-            (from DRIVE_ENV_TOKEN if not given).
+        options: Further options of the interface, e.g. `bitrate=1_000_000`; `token` for a hub that requires one (from
+            DRIVE_ENV_TOKEN if not given).
 
     Raises:
-        BusError: If the bus cannot be opened, a node does not answer or is another device, or two answer as one.
-        ValueError: For an unknown device or pace, a node-ID or a time-out that cannot be.
+        BusError: If the bus cannot be opened, a node does not answer or is another device, or two nodes have one
+            node-ID.
+        ValueError: For an unknown device or pace, an impossible node-ID or time-out.
     """
 
     def __init__(
@@ -86,7 +87,7 @@ class CanDrives(BusDrives):
         if cycle is not None:
             description.cycles_per_sync = cycles_per_sync(cycle, description.cycle, pace)
             description.cycle *= description.cycles_per_sync
-        # A dry run has nothing to wait for either.
+        # Nor does a dry run have anything to wait for.
         by_sync = pace == "lockstep" or bool(dry_run)
         paced: Pace = LockstepPace() if by_sync else RealTimePace(description.cycle)
         port: Port

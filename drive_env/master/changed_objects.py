@@ -1,4 +1,4 @@
-"""Objects of a node that have another value while this master is there, and then get their own back."""
+"""Objects of a node that this master changes temporarily, and restores afterwards."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from drive_env.fieldbus.errors import BusError
 from drive_env.fieldbus.link import NoWatchdogError, ObjectClient
 from drive_env.fieldbus.tidying import Tidying
 
-# 6007h, what an axis does when its connection is lost (CiA 402): nothing, or the quick stop.
+# 6007h, the reaction of an axis to a lost connection (CiA 402): none, or the quick stop.
 _ABORT_CONNECTION, _NO_ACTION, _QUICK_STOP = (cia402.ABORT_CONNECTION_OPTION, 0), b"\0\0", b"\3\0"
 REMEDY = "to move it without that, open it in Python with Limits(silence=None) and keep the emergency stop at hand"
 
 
 class ChangedObjects:
-    """Objects changed for a node's watchdog over its master, with their values of before.
+    """Objects changed for a node's watchdog over its master, with their previous values.
 
     Args:
         node: The node's address, for messages.
         sdo: Its objects.
-        description: What device it is.
+        description: Its device.
     """
 
     def __init__(self, node: int, sdo: ObjectClient, description: Description) -> None:
@@ -37,7 +37,7 @@ class ChangedObjects:
         return key in self._before
 
     def holds(self, key: Key) -> bool:
-        """Return whether a watchdog that was set with these objects depends on one, changed or found right (6007h)."""
+        """Return whether a watchdog set with these objects depends on a key, changed or already right (6007h)."""
         return key in self or key == _ABORT_CONNECTION
 
     def read(self, key: Key) -> bytes:
@@ -45,16 +45,16 @@ class ChangedObjects:
         return self._sdo.read(*key, f"{key[0]:04X}h:{key[1]:02X}", self._description.answer_timeout)
 
     def change(self, key: Key, data: bytes, only_from: bytes | None = None, before: bytes | None = None) -> None:
-        """Give an object other bytes, and see that it has them.
+        """Write other bytes to an object, and verify them.
 
         Args:
             key: The object.
-            data: What it gets.
-            only_from: What it must have now, or else it is left alone.
-            before: The value that it gets back afterwards, by default its present one.
+            data: The new bytes.
+            only_from: The bytes that it must have now, otherwise it is left unchanged; None: any.
+            before: The value to restore afterwards, by default its present one.
 
         Raises:
-            NoWatchdogError: If the node takes them and has others.
+            NoWatchdogError: If the node accepts them but holds others.
             ObjectAccessError: If it refuses; BusError if it does not answer.
         """
         label, timeout = f"{key[0]:04X}h:{key[1]:02X}", self._description.answer_timeout
@@ -75,7 +75,7 @@ class ChangedObjects:
         self._set[key] = data
 
     def quick_stop_on_lost_connection(self) -> None:
-        """Have every axis that would do nothing when its connection is lost do a quick stop then (6007h)."""
+        """Make every axis that would ignore a lost connection do a quick stop then (6007h)."""
         if not self._description.has(_ABORT_CONNECTION):
             return
         entry = self._description.dictionary.find(_ABORT_CONNECTION)
@@ -91,10 +91,10 @@ class ChangedObjects:
         return all(self.read(key)[: len(data)] == data for key, data in self._set.items())
 
     def restore(self) -> None:
-        """Put the objects back as they were.
+        """Restore the objects.
 
         Raises:
-            BusError: If the node did not take all of them.
+            BusError: If the node did not accept all of them.
         """
         before, self._before = self._before, {}
         self._set.clear()
@@ -110,6 +110,6 @@ class ChangedObjects:
             raise BusError(f"node {self._node}: {label} should have {data.hex()} again, and has {now.hex()}")
 
     def forget(self) -> None:
-        """Forget the values of before: the node was reset."""
+        """Forget the previous values: the node was reset."""
         self._before.clear()
         self._set.clear()

@@ -1,7 +1,7 @@
 """EDS and DCF of a drive as it is commissioned (CiA 306): its own EDS, with the values that its parameters have now.
 
-An EDS has them as defaults, a DCF as values of one node (ParameterValue, DeviceComissioning). What is no parameter, a
-command, a service or a set-point, stays as its EDS has it.
+An EDS has them as defaults, a DCF as values of one node (ParameterValue, DeviceComissioning). Commands, services and
+set-points are not parameters: they stay as in the EDS.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ CAN_KBIT = 1000  # kbit/s, unless another bit rate is given
 
 
 def commissioned_values(drives: Drives, node: int = 0, axis: int | None = None) -> dict[Key, int]:
-    """Return the parameters that a node has now, by the index of each of its axes.
+    """Return the present parameters of a node, by the index of each of its axes.
 
     Args:
         drives: Emulated, or on a bus.
-        node: Which of a bus's nodes, from 0; emulated drives are one node from their first axis on.
-        axis: The only axis, from 0, whose parameters are told beside those of the node; all by default.
+        node: Number of the node, from 0; emulated drives count as one node.
+        axis: The one axis, from 0, whose parameters are returned besides the node's; None: all.
     """
     bus = drives.bus
     if bus is not None:
@@ -54,14 +54,14 @@ def commissioned_values(drives: Drives, node: int = 0, axis: int | None = None) 
 def commissioned_eds(
     eds: Path | EdsText, values: Mapping[Key, int], name: str, *, node_id: int | None = None, bit_rate: int = CAN_KBIT
 ) -> str:
-    """Return the text of an EDS with values, or of a DCF.
+    """Return the text of an EDS, or of a DCF, with values.
 
     Args:
-        eds: The drive's own.
+        eds: The drive's own EDS.
         values: Index and sub-index -> integer.
-        name: Of the file.
-        node_id: Of the node; a DCF has one, an EDS none.
-        bit_rate: Of its bus [kbit/s], in a DCF.
+        name: Name of the file.
+        node_id: The node-ID makes it a DCF; None: an EDS.
+        bit_rate: Bit rate of the bus [kbit/s], in a DCF.
     """
     file = eds_file(eds, node_id or 1)
     sections = {title: dict(row) for title, row in file.sections.items()}
@@ -72,7 +72,7 @@ def commissioned_eds(
             continue
         if node_id is not None:
             row["ParameterValue"] = str(value)
-        elif defaults[key] != value:  # what follows the node-ID goes on following it
+        elif defaults[key] != value:  # a default that contains the node-ID keeps that form
             row["DefaultValue"] = str(value)
     info = sections.setdefault("FileInfo", {})
     if node_id is not None:

@@ -1,4 +1,4 @@
-"""Communication cycles of `advance` and `record`: objects mapped, rows out and in, under the envelope's eyes."""
+"""Communication cycles of `advance` and `record`: objects mapped, rows sent and received, watched by the envelope."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-MOST_CALLS = 64  # that are remembered
+MOST_CALLS = 64  # remembered calls
 NOTHING: Sequence[Entry] = ()
 CONTROLWORD = (cia402.CONTROLWORD, 0)
 POLL_TIMEOUT = 0.008  # s for the samples of one SYNC
@@ -41,10 +41,10 @@ class RecordCall:
 
     sampled: Entries to return.
     played: Entries to write, in the order given.
-    watched: What the envelope wanted sampled when `chosen` was made.
-    chosen: What is sampled: `sampled` and as much of `watched` as fits.
-    mapping: The number of the mapping that has all of it.
-    asked: Of `sampled`, what is asked for by SDO meanwhile, since it does not fit.
+    watched: The objects that the envelope watched when `chosen` was made.
+    chosen: The objects to sample: `sampled` and as many of `watched` as fit.
+    mapping: The number of the mapping that has all of them.
+    asked: Those of `sampled` that do not fit and are read by SDO meanwhile.
     """
 
     sampled: tuple[Entry, ...]
@@ -56,11 +56,11 @@ class RecordCall:
 
     @property
     def mapped(self) -> tuple[Entry, ...]:
-        """Those of `sampled` that process data are to carry."""
+        """Those of `sampled` that go into process data."""
         return tuple(entry for entry in self.sampled if entry not in self.asked)
 
     def ask_for_states(self) -> bool:
-        """Have states asked for that are sampled; return whether that leaves less to process data."""
+        """Have sampled states read by SDO instead; return whether that leaves less for process data."""
         before = self.asked
         self.asked = tuple(entry for entry in self.sampled if (entry.index, entry.sub) in CAN_BE_ASKED)
         return self.asked != before
@@ -70,12 +70,12 @@ class CycleRunner:
     """Runs communication cycles of the drives of a bus.
 
     Args:
-        description: What device the nodes are.
+        description: The nodes' device.
         num_axes: Axes of all nodes.
         link: The bus.
         pace: When SYNCs are due.
-        start: Takes the nodes to where they exchange process data, once.
-        catch_up: Returns when nodes in lockstep have seen every SYNC.
+        start: Makes the nodes operational, once.
+        catch_up: Waits until nodes in lockstep have handled every SYNC.
         read: Reads an object of every axis by SDO.
     """
 
@@ -97,7 +97,7 @@ class CycleRunner:
         self._nothing = RecordCall((), ())
 
     def pass_time(self, cycles: int, envelope: CycleWatch | None) -> None:
-        """Let cycles pass by the clock: where this computer was late, SYNCs are left out."""
+        """Let cycles pass by the clock: SYNCs for which this computer was too late are left out."""
         with self._running:
             samples = None
             if envelope is not None:
@@ -107,7 +107,7 @@ class CycleRunner:
             self._pace.end(self._link.receive)
 
     def prepare(self, envelope: CycleWatch) -> None:
-        """Have mapped what the envelope watches, as far as it fits."""
+        """Have the objects mapped that the envelope watches, as far as they fit."""
         with self._running:
             self._map(self._nothing, envelope)
 
@@ -116,9 +116,10 @@ class CycleRunner:
         return self._process.sampled_entries()
 
     def poll(self, envelope: CycleWatch) -> bool | None:
-        """Send a SYNC of the supervisor's own and look at what comes back.
+        """Send a SYNC of the supervisor's own and observe its samples.
 
-        Returns whether all of it came; None where the program's own cycles are under way, or nothing is mapped.
+        Returns:
+            False if not all of them came; None if the program's own cycles are under way or nothing is mapped.
         """
         if not self._running.acquire(blocking=False):
             return None
@@ -148,7 +149,7 @@ class CycleRunner:
         try:
             if (known := self._calls.get(names)) is not None:
                 return known
-        except TypeError:  # a name of a wrong type, about which `find` has its message
+        except TypeError:  # a name of a wrong type, for which `find` has the message
             pass
         entries = self._description.dictionary
         sampled = tuple(dict.fromkeys(entries.find(name) for name in objects))
@@ -219,7 +220,7 @@ class CycleRunner:
 
     # --- inside ---------------------------------------------------------------------------------------------------
     def _map(self, call: RecordCall, envelope: CycleWatch | None) -> None:
-        """Have a call's objects mapped, and what the envelope watches if it fits besides, from now on."""
+        """Map a call's objects and, if they fit, the objects that the envelope watches."""
         watched = NOTHING if envelope is None else envelope.watched()
         played = tuple(dict.fromkeys(call.played))
         if call.watched is not watched:
@@ -228,7 +229,7 @@ class CycleRunner:
             return
         try:
             self._have_mapped(call, played)
-        except ObjectAccessError:  # as while an axis is enabled, where a drive then changes nothing
+        except ObjectAccessError:  # say, while an axis is enabled: some drives change no mapping then
             if not self._asks_for_states(call):
                 raise
             call.chosen = self._choose(call, watched, played)
@@ -243,11 +244,11 @@ class CycleRunner:
             self._process.map(played, call.chosen)
 
     def _asks_for_states(self, call: RecordCall) -> bool:
-        """Have states of a call asked for, by the clock: where time waits nothing would come between two cycles."""
+        """Have states of a call read by SDO, in real time only: in lockstep nothing would come between two cycles."""
         return not self._pace.time_waits and call.ask_for_states()
 
     def _choose(self, call: RecordCall, watched: Sequence[Entry], played: tuple[Entry, ...]) -> tuple[Entry, ...]:
-        """Return the entries to sample; states are read by SDO where not all that a call wants fits."""
+        """Return the entries to sample; states are read by SDO if the call's objects do not all fit."""
         try:
             return self._process.choose(call.mapped, watched, played)
         except ObjectAccessError:
@@ -270,7 +271,7 @@ class CycleRunner:
         if envelope is not None and samples is not None:
             # Bound here: the closure is called once a millisecond.
             watcher, held = envelope, samples
-            # Samples of a run that plays controlwords do not tell what these have done, or will have.
+            # Samples of a run that plays controlwords may be from before or after their effect.
             asked = envelope.epoch if epoch is _NOW else -1
 
             def watch(first: int, end: int) -> None:

@@ -21,37 +21,37 @@ if TYPE_CHECKING:
     from drive_env.master.ethercat.frame_ways import FrameWay
 
 RAW, UDP = "ethercat", "ethercat-udp"
-OF_CAN = ("bitrate", "bus", "dry_run", "token")  # what `CanDrives` takes besides
+OF_CAN = ("bitrate", "bus", "dry_run", "token")  # options of `CanDrives` only
 
 
 class EtherCatDrives(BusDrives):
     """Drives on EtherCAT, with the interface of `EmulatedDrives`: the same calls, the same integers.
 
     Axes are those of the first slave, then those of the second, and so on. All slaves of the segment are this
-    program's: they are found and taken to Pre-Op when the drives are opened, to Op when process data or a safeguard
-    need it, and to Init by `close`. `read` and `write` are SDO transfers (CoE). `record` samples and plays in the
-    process images; a sample is what the drive had before it took the row that is played with it. Images can be changed
-    in Pre-Op alone, where no motor runs: what is recorded or played while an axis is enabled must be in them, so record
-    or play it once before.
+    program's: they are found and taken to Pre-Op when the drives are opened, to Op when process data or a watchdog need
+    it, and to Init by `close`. `read` and `write` are SDO transfers (CoE). `record` samples and plays in the process
+    images; a sample is the drive's value before it applied the row played with it. Images can be changed only in
+    Pre-Op, where no motor runs: objects to record or play while an axis is enabled must be in them already, so record
+    or play them once before.
 
     Args:
         device: Name of a known device; ignored with `eds`.
         eds: EDS of any other CiA 402 drive with CoE.
         interface: "ethercat": a network interface, by pysoem (extra `ethercat`); "ethercat-udp": EtherCAT over UDP on
-            this computer, as `drive-env serve` has it.
+            this computer, as served by `drive-env serve`.
         channel: The network interface, e.g. "eth1", or the UDP port; from DRIVE_ENV_CHANNEL if not given.
         nodes: Positions of the slaves in the line, from 0, all of this device.
         pace: "real-time": time passes by the clock, one frame per communication cycle. "lockstep": time passes by
-            frames, for an emulator served so.
-        safety: Limits; False for none at all, which is for emulators.
+            frames, for an emulator served with --lockstep.
+        safety: Limits; False: no limits, which is for emulators.
         options: `sync0`, whether outputs take effect with SYNC0 of the distributed clocks, once a cycle; `master`, an
             `EtherCatMaster` in place of interface and channel; `cycle`, time between two frames in real time [s], whole
             communication cycles of the drives; `timeout`, longest wait for an answer [s], and `timeouts`, object -> the
-            same.
+            same for that object.
 
     Raises:
         BusError: If the segment cannot be opened, a slave does not answer or is another device.
-        ValueError: For an unknown device, pace or option, a position or a time that cannot be.
+        ValueError: For an unknown device, pace or option, an impossible position or time.
     """
 
     def __init__(
@@ -105,7 +105,7 @@ def open_master(interface: str, channel: str | None, frame_timeout: float | None
 
     Raises:
         OpenError: If it cannot be opened.
-        ValueError: For another interface, or a channel that cannot be.
+        ValueError: For another interface, or an impossible channel.
     """
     name = channel if channel is not None else os.environ.get("DRIVE_ENV_CHANNEL")
     if interface == RAW:
@@ -118,7 +118,7 @@ def open_master(interface: str, channel: str | None, frame_timeout: float | None
 
 
 def open_frames(interface: str | None, channel: str | None, frame_timeout: float | None = None) -> FrameMaster:
-    """Open a master that makes its frames by itself, as `open_master` does; on a network interface for a look alone."""
+    """Open our own master, with arguments as `open_master`; on a network interface only to inspect a segment."""
     from drive_env.master.ethercat.frame_master import FRAME, FrameMaster
 
     return FrameMaster(_open_way(interface, channel), frame_timeout or FRAME)
@@ -142,7 +142,7 @@ def _open_way(interface: str | None, channel: str | None) -> FrameWay:
 
 
 def check_positions(nodes: Iterable[int]) -> tuple[int, ...]:
-    """Return positions; ValueError for one that cannot be, for the same twice, and for none."""
+    """Return the positions; ValueError if one is impossible or given twice, or the list is empty."""
     positions = tuple(int(node) for node in nodes)
     if not positions or len(set(positions)) < len(positions) or min(positions) < 0:
         raise ValueError(f"nodes={list(positions)} must be positions in the line, from 0, each once")

@@ -1,6 +1,6 @@
-"""Which drive it is: a node's identity in 1008h to 100Ah and 1018h, so that a file is not written to another drive.
+"""A node's identity, 1008h to 100Ah and 1018h: a file is not written to another drive.
 
-A serial number is asked for also where the EDS lists none: later firmware of the same device has it.
+A serial number is read even if the EDS lists none: later firmware of the same device has it.
 """
 
 from __future__ import annotations
@@ -84,12 +84,12 @@ def read_identity(drives: DescribedAxes, node: int = 0) -> Identity:
         vendor=number(1),
         product=number(2),
         revision=number(3),
-        serial=number(4) or None,  # 0 is what a drive says that has none
+        serial=number(4) or None,  # a drive without a serial number reports 0
     )
 
 
 def load_identity(table: Mapping[str, Any]) -> Identity | None:
-    """Return the identity of a TOML table; None if it holds none that is whole."""
+    """Return the identity of a TOML table; None if it lacks one or has an incomplete one."""
     kinds = {name: str if name in _TEXTS else int for name in Identity._fields}
     known: dict[str, Any] = {
         name: value for name, value in table.items() if name in kinds and type(value) is kinds[name]
@@ -98,15 +98,15 @@ def load_identity(table: Mapping[str, Any]) -> Identity | None:
 
 
 def check_same_drive(file: object, written: Identity | None, found: Identity, *, other_drive: bool = False) -> None:
-    """Raise OtherDriveError unless a file was read from the drive that is there.
+    """Raise OtherDriveError unless a file was read from the connected drive.
 
-    The serial number tells; a drive that has none is told by its node-ID. Another firmware revision may count in other
-    units, and is refused, too.
+    Drives are distinguished by serial number, or by node-ID if they have none. Another firmware revision may count in
+    other units, and is refused, too.
 
     Args:
-        file: For the message.
-        written: Of the drive that the file was read from; None where it does not say.
-        found: Of the drive that is there.
+        file: The file, for the message.
+        written: Identity of the drive that the file was read from; None if the file has none.
+        found: Identity of the connected drive.
         other_drive: Let any drive pass.
     """
     if other_drive or written is None:

@@ -18,7 +18,7 @@ def is_ethercat(interface: str | None) -> bool:
 
 
 def default_nodes(interface: str | None) -> tuple[int, ...]:
-    """Return the nodes by default: node-ID 1 on CAN, the first position on EtherCAT."""
+    """Return the default nodes: node-ID 1 on CAN, the first position on EtherCAT."""
     return (0,) if is_ethercat(interface) else (1,)
 
 
@@ -27,11 +27,11 @@ def open_drives(device: str = DEFAULT_DEVICE, **options: Any) -> BusDrives:
 
     Args:
         device: Name of a known device.
-        options: What `CanDrives` or `EtherCatDrives` take besides; without `nodes`, the first node.
+        options: Further arguments of `CanDrives` or `EtherCatDrives`; without `nodes`, the first node.
 
     Raises:
         BusError: If the bus cannot be opened, a node does not answer or is another device.
-        ValueError: For what cannot be.
+        ValueError: For an impossible argument.
     """
     interface = options.get("interface")
     if options.get("nodes") is None:
@@ -46,15 +46,15 @@ def open_drives(device: str = DEFAULT_DEVICE, **options: Any) -> BusDrives:
 
 
 def check_answers(device: str = DEFAULT_DEVICE, **options: Any) -> None:
-    """Raise NoAnswerError for a node on CAN that is silent: to open it as drives would send it an NMT command.
+    """Raise NoAnswerError for a silent node on CAN, without the NMT command that opening the drives would send.
 
     Args:
         device: Name of a known device.
-        options: As `open_drives` takes them; of those, how the bus is reached, the nodes, and the EDS.
+        options: As for `open_drives`; used are those for the bus, the nodes and the EDS.
     """
     interface = options.get("interface")
     if is_ethercat(interface):
-        return  # who opens a segment takes its slaves to another state in any case
+        return  # opening a segment changes its slaves' states in any case
     from drive_env.master.can_drives import check_nodes_answer
 
     asked = {key: options.get(key) for key in ("channel", "eds", "timeout", "bitrate")}

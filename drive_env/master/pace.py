@@ -1,4 +1,4 @@
-"""When the next SYNC is due."""
+"""Pace of cycles: when the next SYNC is due."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from typing import Protocol
 from drive_env.drives.arguments import whole_cycles
 from drive_env.fieldbus.link import Timing
 
-MOST_FRAMES = 256  # taken in between two SYNCs; a bus of 1 Mbit/s carries about 8 in a millisecond
+MOST_FRAMES = 256  # received between two SYNCs; a bus of 1 Mbit/s carries about 8 in a millisecond
 CATCH_UP = 0.02  # of a cycle, by which a SYNC is moved to suit the drives' clocks
 LONGEST_CYCLE = 0.1  # s: a slower cycle would leave the drives without monitoring
-Receive = Callable[[float], bool]  # waits so many seconds for a frame; whether one came
+Receive = Callable[[float], bool]  # waits that many seconds for a frame; returns whether one came
 
 
 def _take_in(receive: Receive) -> None:
-    """Receive waiting frames, but not for ever where more come than can be received."""
+    """Receive waiting frames; ends even if frames arrive faster than they are processed."""
     for _ in range(MOST_FRAMES):
         if not receive(0.0):
             return
@@ -25,7 +25,7 @@ def _take_in(receive: Receive) -> None:
 class Pace(Protocol):
     """The calls of a run of cycles to its pace."""
 
-    window: int  # SYNCs that may be out before their samples are in
+    window: int  # SYNCs that may be sent before their samples have arrived
     time_waits: bool  # whether no time passes while no SYNC is sent
     timing: Timing  # of the last run
     total: Timing  # of all runs
@@ -43,14 +43,14 @@ class Pace(Protocol):
 class RealTimePace:
     """One SYNC per communication cycle by the clock.
 
-    A SYNC that is more than a cycle late shifts those that follow: several at once would not make the motor faster,
-    only its set-points. Between runs of cycles, which a policy makes one by one, half a cycle does: one action that
-    took 1.1 ms leaves the drives' rhythm as it was.
+    A SYNC that is more than a cycle late shifts the following ones: several at once would not make the motor faster,
+    only its set-points. Between runs of cycles, which a policy makes one by one, half a cycle late is the limit: a
+    single action of 1.1 ms does not shift the drives' rhythm.
 
     Args:
         cycle: Communication cycle [s].
-        phase: Returns how much later than an instant [s, of perf_counter] a SYNC suits the drives' clocks [s]; None:
-            they have none to suit.
+        phase: Returns the delay [s] after an instant [s, of perf_counter] at which a SYNC suits the drives' clocks;
+            None if they have no clocks.
     """
 
     window = 64
@@ -79,7 +79,7 @@ class RealTimePace:
             Timing(one.cycles + 1, one.late + late, max(one.worst, lateness)) for one in (self.timing, self.total)
         )
         self._due = (now if late else self._due) + self._cycle
-        if self._phase is not None:  # this computer's clock is another one
+        if self._phase is not None:  # this computer's clock runs at another rate
             ahead = self._phase(self._due)
             off = ahead if ahead < 0.5 * self._cycle else ahead - self._cycle
             self._due += min(max(off, -CATCH_UP * self._cycle), CATCH_UP * self._cycle)
@@ -96,7 +96,7 @@ class RealTimePace:
 
 
 class LockstepPace:
-    """SYNCs as fast as the emulator answers; time passes by them alone."""
+    """SYNCs as fast as the emulator answers; time passes only with them."""
 
     window = 16
     time_waits = True

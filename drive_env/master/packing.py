@@ -1,4 +1,4 @@
-"""Integers of axes to the bytes of process data and back, whatever carries them."""
+"""Integers of axes to the bytes of process data and back, for every fieldbus."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Bytes = NDArray[np.uint8]
 
 
 class Member(NamedTuple):
-    """An object in packed data: of which axis of the node, at which byte, how many."""
+    """An object in packed data: its axis of the node, first byte and length."""
 
     entry: Entry
     axis: int
@@ -25,12 +25,12 @@ class Member(NamedTuple):
 
 
 def pack_rows(members: Iterable[Member], played: Mapping[Entry, Integers], first_axis: int) -> Bytes:
-    """Return the bytes of members that lie one behind the other, shape (rows, length).
+    """Return the bytes of consecutive members, shape (rows, length).
 
     Args:
-        members: What is packed.
+        members: The members.
         played: Integers of each entry, shape (rows, num_axes).
-        first_axis: Number of the node's first axis among those.
+        first_axis: Number of the node's first axis among num_axes.
     """
     parts = []
     for member in members:
@@ -45,9 +45,9 @@ def unpack_rows(
     """Put the integers of members into `values`, each object of shape (rows, num_axes).
 
     Args:
-        values: Where they go; objects that are not there yet are added.
+        values: The result; missing objects are added.
         data: Shape (rows, length).
-        members: What is packed in them.
+        members: The members in the data.
         first_axis: Number of the node's first axis.
         num_axes: Axes of all nodes.
     """

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def checked_origin(file: Path, *, unchecked: bool) -> tuple[Identity | None, int | None]:
-    """Return from which drive and axis a file was read, None where it does not say; raise if it is not as written."""
+    """Return the drive and axis that a file was read from, None if it does not name them; raise if it was changed."""
     table = _read_toml(file)
     check_seal(file, table, unchecked=unchecked)
     identity = table.get("identity")
@@ -32,7 +32,7 @@ def checked_origin(file: Path, *, unchecked: bool) -> tuple[Identity | None, int
 
 
 def parameters_text(drives: DescribedAxes, axis: int, values: Mapping[tuple[int, int], int]) -> str:
-    """Return parameters as TOML; the objects' names are comments, their index is what counts."""
+    """Return parameters as TOML; the index counts, the objects' names are comments."""
     known = drives.description
     lines = [
         f"# Parameters of node {drives.nodes[0]}. The check sum at the end shows a change, and restore refuses a "
@@ -72,7 +72,6 @@ def load_parameters(path: Path, dictionary: ObjectDictionary) -> dict[tuple[int,
 
 
 def _read_toml(path: Path) -> dict[str, Any]:
-    """Read a TOML file; ValueError if it is not TOML."""
     if not path.is_file():
         raise ValueError(f"there is no file {path}; write one with `drive-env parameters backup {path}`")
     try:

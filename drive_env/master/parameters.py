@@ -1,6 +1,6 @@
 """The parameters of a drive as a set: read, compared, and written all or none.
 
-A parameter is what stays: settings, not commands, not services. PDOs are remapped in the order that CiA 301 demands.
+Parameters are settings, not commands or services. PDOs are remapped in the order that CiA 301 demands.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ if TYPE_CHECKING:
 
 SAVE = 0x65766173  # CiA 301: "save", written to 1010h
 
-_DEVICE_OBJECTS = 0x2000  # from here on; what lies below is how a node talks
+_DEVICE_OBJECTS = 0x2000  # from here on; objects below are those of communication
 _COMMUNICATION = (range(0x1400, 0x1600), range(0x1800, 0x1A00))
-_MAPPING_ABOVE = 0x200  # the mapping of a PDO lies so far above its communication parameter
-# What sync managers 2 and 3 of EtherCAT carry, and the mappings that are meant: none is changed while it is assigned.
+_MAPPING_ABOVE = 0x200  # offset of a PDO's mapping from its communication parameter
+# Assignments of EtherCAT's sync managers 2 and 3 and their mappings: none is changed while it is assigned.
 _ASSIGNMENTS = {0x1C12: range(0x1600, 0x1800), 0x1C13: range(0x1A00, 0x1C00)}
 
 
 class Difference(NamedTuple):
-    """A parameter with another value than it should have; `found` is None where the drive lacks it."""
+    """A parameter with another value than wanted; `found` is None if the drive lacks it."""
 
     entry: Entry
     wanted: int
@@ -41,19 +41,19 @@ class Difference(NamedTuple):
 
 
 class CommandObjectError(ValueError):
-    """An object that commands or serves stands among parameters."""
+    """A command or service is among the parameters."""
 
 
 class RollbackError(BusError):
-    """A write failed and earlier writes could not be taken back: the drive holds a mixture."""
+    """A write failed and earlier writes could not be undone: the drive holds a mixture."""
 
 
 class NotRestoredError(BusError):
-    """A write failed; earlier writes were taken back."""
+    """A write failed; earlier writes were undone."""
 
 
 def command(index: int, hints: MasterHints) -> str:
-    """Return the name of the command or service that an object is, "" for parameters; also for further axes."""
+    """Return the name of the command or service that an object is, also for further axes; "" for a parameter."""
     return COMMANDS.get(cia402.of_first_axis(index)) or hints.commands.get(index, "")
 
 
@@ -67,14 +67,14 @@ def check_no_commands(keys: Iterable[Key], where: object, hints: MasterHints) ->
 
 
 def restorable(values: Mapping[Key, int], hints: MasterHints) -> dict[Key, int]:
-    """Return the values that may be written back to a device: without node-ID, bit rate and the like."""
+    """Return the values that may be written back to a device: without node-ID, bit rate and similar."""
     return {key: value for key, value in values.items() if key[0] not in hints.addresses}
 
 
 def parameters(drives: DescribedAxes) -> list[Entry]:
     """Return the entries that are parameters of a drive."""
     known = drives.description
-    further = known.of_further_axes()  # an EDS may list them all: their commands are those of the first axis
+    further = known.of_further_axes()  # if listed, their commands are those of the first axis
 
     def commands(entry: Entry) -> bool:
         first, _ = further.get((entry.index, entry.sub), (entry, 0))
@@ -90,7 +90,7 @@ def parameters(drives: DescribedAxes) -> list[Entry]:
 def read_parameters(
     drives: DescribedAxes, axis: int = 0, chosen: Callable[[Entry], bool] = lambda entry: True
 ) -> dict[Key, int]:
-    """Return the chosen parameters of an axis that the drive has; what it refuses to show is left out."""
+    """Return the chosen parameters of an axis, without those that the drive refuses to show."""
     found = {}
     for entry in filter(chosen, parameters(drives)):
         with contextlib.suppress(ObjectAccessError):
@@ -117,8 +117,8 @@ def write_all_or_none(drives: DescribedAxes, wanted: Mapping[Key, int], axis: in
 
     Raises:
         CommandObjectError: If there is a command or a service among them; nothing was written.
-        NotRestoredError: If the drive refused or holds something else than was written; it is as it was before.
-        RollbackError: If the values before could not be written back; the message lists them.
+        NotRestoredError: If the drive refused a value or holds another one; all changes were undone.
+        RollbackError: If the previous values could not be written back; the message lists them.
     """
     hints = drives.description.hints
     check_no_commands(wanted, "what is to be written", hints)
@@ -140,13 +140,13 @@ def write_all_or_none(drives: DescribedAxes, wanted: Mapping[Key, int], axis: in
 
 
 def check_at_rest(drives: DescribedAxes, wanted: Iterable[Key], axis: int = 0) -> None:
-    """Raise NotRestoredError if a drive may turn an axis that these parameters touch."""
+    """Raise NotRestoredError if an axis that these parameters affect may turn."""
     if any(_is_live(drives, other) for other in _affected(drives, wanted, axis)):
         raise NotRestoredError("the axis is enabled, and parameters are not exchanged under way; disable it first")
 
 
 def _affected(drives: DescribedAxes, wanted: Iterable[Key], axis: int) -> Iterable[int]:
-    """Return the axes that a change touches: how a node talks is of all its axes."""
+    """Return the axes that a change affects: all of them for objects of communication."""
     count = drives.description.num_axes
     if all(index >= _DEVICE_OBJECTS and cia402.of_first_axis(index) == index for index, _ in wanted):
         return (axis,)
@@ -179,7 +179,7 @@ def _roll_back(drives: DescribedAxes, before: Mapping[Key, int], axis: int, caus
 
 
 def _pdos_of(drives: DescribedAxes, changes: list[Difference]) -> list[Key]:
-    """Return all that belongs to the PDOs that change: they are switched off for it, and emptied."""
+    """Return all objects of the PDOs that change: these are switched off and emptied for the change."""
     bases = {_pdo_of(change.entry.index) for change in changes} - {None}
     images = {_assignment_of(change.entry.index) for change in changes} - {None}
     return [
@@ -190,7 +190,7 @@ def _pdos_of(drives: DescribedAxes, changes: list[Difference]) -> list[Key]:
 
 
 def read_these(drives: DescribedAxes, keys: Iterable[Key], axis: int) -> dict[Key, int]:
-    """Return objects of an axis as they are now."""
+    """Return the present values of objects of an axis."""
     return {key: int(drives.read_axis(drives.description.dictionary.find(key), axis)) for key in keys}
 
 
@@ -200,7 +200,7 @@ def _write(drives: DescribedAxes, changes: Mapping[Key, int], before: Mapping[Ke
 
 
 def _in_order(changes: Mapping[Key, int], before: Mapping[Key, int]) -> Iterator[tuple[Key, int]]:
-    """Return the writes: as they come, but a PDO is switched off and emptied, then filled, then switched on."""
+    """Return the writes: as given, but a PDO is switched off and emptied, then filled, then switched on."""
     pdos: dict[int, None] = {}
     images: dict[int, dict[int, None]] = {}
     for (index, sub), value in changes.items():
@@ -235,7 +235,7 @@ def _in_order(changes: Mapping[Key, int], before: Mapping[Key, int]) -> Iterator
 
 
 def _as_list(index: int, changes: Mapping[Key, int], before: Mapping[Key, int]) -> Iterator[tuple[Key, int]]:
-    """Return the writes of a list, whose entries are changed while it has none."""
+    """Return the writes of a list, whose entries are changed while its count is 0."""
     wanted = {key: changes.get(key, value) for key, value in before.items() if key[0] == index}
     count = wanted[index, 0]
     yield (index, 0), 0
@@ -246,12 +246,12 @@ def _as_list(index: int, changes: Mapping[Key, int], before: Mapping[Key, int]) 
 
 
 def _assignment_of(index: int) -> int | None:
-    """Return the assignment of EtherCAT that an object is, or that may have this mapping."""
+    """Return the EtherCAT assignment that an object is, or that may contain this mapping; None for other objects."""
     return next((one for one, mappings in _ASSIGNMENTS.items() if index == one or index in mappings), None)
 
 
 def _pdo_of(index: int) -> int | None:
-    """Return the index of the communication parameter of the PDO that an object belongs to."""
+    """Return the index of the communication parameter of an object's PDO; None if it belongs to no PDO."""
     for area in _COMMUNICATION:
         if index in area:
             return index
@@ -261,6 +261,6 @@ def _pdo_of(index: int) -> int | None:
 
 
 def list_differences(differences: list[Difference]) -> str:
-    """Return the first differences in words, and how many more there are."""
+    """Return the first differences as text, and the number of further ones."""
     shown = [f"{d.entry.label} is {d.found}, not {d.wanted}" for d in differences[:5]]
     return ", ".join(shown) + (f" and {len(differences) - 5} more" if len(differences) > 5 else "")

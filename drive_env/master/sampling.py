@@ -20,22 +20,22 @@ def run_cycles(
     barrier: Callable[[], None] | None = None,
     skip_missed: bool = False,
 ) -> None:
-    """Let communication cycles pass: in cycle k row k of the outputs goes out, then SYNC; row k of the samples comes.
+    """Let communication cycles pass: in cycle k, send row k of the outputs, then SYNC; receive row k of the samples.
 
     Args:
         link: The bus.
         pace: When SYNCs are due.
-        cycles: How many.
-        outputs: A row for each cycle, or None for none.
-        samples: What comes back, or None for nothing.
-        timeout: Longest wait for them [s].
-        observe: Called with the numbers of the first and the last (excluded) row that are complete and new; with it
-            no SYNC goes out before the row of the one before was looked at, except where time does not wait.
-        barrier: Called now and then, where no samples come back: returns when the nodes have caught up.
-        skip_missed: Cycles that passed while a SYNC was late count: fewer are sent, and the time is kept.
+        cycles: Number of cycles.
+        outputs: A row for each cycle; None: nothing is sent.
+        samples: Collects the samples; None: nothing is sampled.
+        timeout: Longest wait for samples [s].
+        observe: Called with the numbers of the first and the last (excluded) row that are complete and new; in lockstep
+            no SYNC is sent before the previous one's row was observed.
+        barrier: Called now and then if there are no samples: waits until the nodes have caught up.
+        skip_missed: Whether cycles missed by a late SYNC count: fewer SYNCs are sent, and the time is kept.
 
     Raises:
-        NoAnswerError: If samples stay out.
+        NoAnswerError: If samples do not come.
     """
     window = 0 if observe is not None and pace.time_waits else pace.window
     seen = needed = 0
@@ -43,15 +43,15 @@ def run_cycles(
     def look() -> None:
         nonlocal seen
         if samples is not None and observe is not None:
-            # Where time waits, what is seen must not depend on how fast this computer is: only what was waited for.
+            # In lockstep the observed rows must not depend on this computer's speed: only awaited ones are observed.
             complete = min(samples.complete(), max(needed, 0) if pace.time_waits else cycles)
             if complete > seen:
                 first, seen = seen, complete
                 observe(first, complete)
 
     pace.begin()
-    # The first row has no SYNC to wait for, and its frames take 0.1 ms each on the bus: a policy that computes it in
-    # what is left of a cycle meets the next SYNC. Later rows go out just before theirs, and overtake none.
+    # The first row waits for no SYNC, and its frames take 0.1 ms each on the bus: sent at once, a row that a policy
+    # computes late in a cycle still makes the next SYNC. Later rows are sent just before their SYNC, and overtake none.
     if cycles and outputs is not None:
         outputs.send(0)
     sent = passed = 0

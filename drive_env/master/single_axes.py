@@ -1,6 +1,6 @@
-"""Drives, emulated or on a bus, with the parts that commands for parameters need of a bus: one axis at a time.
+"""Drives, emulated or on a bus, as commands for parameters need them: one axis at a time.
 
-What is written goes through the Drives interface, and so through its envelope.
+Writes go through the Drives interface, and so through its envelope.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class SingleAxes:
 
     Args:
         drives: The drives.
-        description: Of their device.
+        description: Their device's description.
     """
 
     def __init__(self, drives: Drives, description: Description) -> None:
@@ -61,7 +61,7 @@ class SingleAxes:
 
 
 class _Objects:
-    """Reads objects of a node as bytes: for its identity."""
+    """Reads objects of a node as bytes, for its identity."""
 
     def __init__(self, axes: SingleAxes, node: int) -> None:
         self._axes = axes

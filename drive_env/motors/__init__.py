@@ -1,12 +1,13 @@
-"""The motors: a TOML file each, with the source of every number; a motor of one's own by its file, or made in Python.
+"""The motors: a TOML file each, with the source of every number; or the user's own, by its file or made in Python.
 
-SI; phase values, amplitude-invariant dq, currents as peak i_q. A file may say what a data sheet has (between two
-terminals, per rpm, RMS), and is converted here. Catalogues of block commutation give k_t so that psi_m = k_t / (sqrt(3)
-n_p), with which the no-load speed is theirs; the torque constant of peak i_q is then 1.5 n_p psi_m = 0.866 k_t.
+SI; phase values, amplitude-invariant dq, currents as peak i_q. A file may have the data sheet's form (between two
+terminals, per rpm, RMS), which is converted here. Catalogues of block commutation give k_t so that psi_m = k_t /
+(sqrt(3) n_p), with which the no-load speed is theirs; the torque constant of peak i_q is then 1.5 n_p psi_m = 0.866
+k_t.
 
-A stepper is a hybrid motor of two phases: its holding torque is that of both phases at their rated RMS current, which
-is a current vector of sqrt(2) times that, and falls behind the proportional as a current saturates the iron:
-torque = n_p psi_m i / sqrt(1 + saturation i^2).
+A stepper is a hybrid motor of two phases: its holding torque is that of both phases at their rated RMS current, a
+current vector of sqrt(2) times that. It grows less than in proportion to the current, which saturates the iron: torque
+= n_p psi_m i / sqrt(1 + saturation i^2).
 """
 
 from __future__ import annotations
@@ -24,16 +25,16 @@ FOLDER = Path(__file__).parent
 
 
 class MotorError(ValueError):
-    """A file that describes no motor; the message names the number and the remedy."""
+    """A file that does not describe a motor; the message names the number and the remedy."""
 
 
 class PullOut(NamedTuple):
     """The torque that a stepper gives at rated current before it falls out of step, over its speed.
 
     Attributes:
-        supply: Of the chopper [V].
+        supply: Supply of the chopper [V].
         speed: Increasing [rad/s], (n,).
-        torque: At the shaft [N m], (n,).
+        torque: Torque at the shaft [N m], (n,).
     """
 
     supply: float
@@ -72,20 +73,20 @@ class Motor(NamedTuple):
     kind: str = "pmsm"
     thermal_time: float = 600.0  # s, winding and housing
     flux_temperature: float = -1.1e-3  # 1/K, of neodymium magnets
-    # How its cable is wired, which the drive's settings of encoder and halls must make up for.
+    # Wiring of its cable, for which the drive's settings of encoder and halls must make up.
     encoder_direction: int = 0
     hall_polarity: int = 0
     hall_direction: int = 0
     saturation: float = 0.0  # 1/A^2, of a stepper
-    pull_out: PullOut | None = None  # of a stepper, where it is known
+    pull_out: PullOut | None = None  # of a stepper; None if unknown
 
     @property
     def torque_constant(self) -> float:
-        """Torque per ampere of peak i_q, of a DC motor per ampere, of a stepper at small current [N*m/A]."""
+        """Torque per ampere of peak i_q (DC motor: per ampere; stepper: at small current) [N*m/A]."""
         return self._phase_factor * self.n_p * self.psi_m
 
     def torque(self, current: float) -> float:
-        """Return the torque [N m] of a current of this peak [A], of a stepper of a current vector of this size."""
+        """Return the torque [N m] at this peak current [A], for a stepper at a current vector of this size."""
         return self.torque_constant * current / math.sqrt(1.0 + self.saturation * current * current)
 
     @property
@@ -100,7 +101,7 @@ class Motor(NamedTuple):
 
     @property
     def _phase_factor(self) -> float:
-        return 1.5 if self.kind == "pmsm" else 1.0  # two phases, or one, add up as they are
+        return 1.5 if self.kind == "pmsm" else 1.0  # two phases, or one, add directly
 
 
 # IEC 60449: up to 120 V of direct current is band I, extra-low voltage; a winding for it is not insulated for band II,
@@ -129,7 +130,7 @@ RANGES = {
 
 
 class Number(NamedTuple):
-    """A number in a file: unit, meaning, least and greatest, and whether that end is a value itself."""
+    """A number in a file: unit, meaning, least and greatest, and whether each end is a valid value."""
 
     unit: str
     meaning: str
@@ -138,10 +139,10 @@ class Number(NamedTuple):
     with_low: bool = False
 
 
-# Of one quantity a file has one number, in the form of its data sheet.
+# A file has each quantity once, in the form of its data sheet.
 RESISTANCE = ("resistance_phase_ohm", "resistance_line_to_line_ohm", "resistance_ohm")
 INDUCTANCE = ("inductance_phase_h", "inductance_line_to_line_h", "inductance_h")
-INDUCTANCE_D = ("inductance_d_phase_h", "inductance_d_line_to_line_h")  # each with that of q, in place of INDUCTANCE
+INDUCTANCE_D = ("inductance_d_phase_h", "inductance_d_line_to_line_h")  # each with that of q, instead of INDUCTANCE
 INDUCTANCE_Q = ("inductance_q_phase_h", "inductance_q_line_to_line_h")
 TORQUE_CONSTANT = (
     "torque_constant_peak", "torque_constant_rms", "torque_constant_line_to_line", "back_emf_line_peak_v_per_krpm",
@@ -149,7 +150,7 @@ TORQUE_CONSTANT = (
 )  # fmt: skip
 RATED_CURRENT = ("rated_current_peak_a", "rated_current_rms_a")
 KINDS = {"pmsm": "brushless", "dc": "brushed", "stepper": "two-phase hybrid stepper"}
-OF_DC = ("resistance_ohm", "inductance_h", "torque_constant")  # a brushed motor's, which has no phases
+OF_DC = ("resistance_ohm", "inductance_h", "torque_constant")  # of a brushed motor, which has no phases
 DC_CONSTANT = ("torque_constant", "speed_constant_rpm_per_v")
 NUMBERS: dict[str, Number] = {
     "resistance_phase_ohm": Number("ohm", "winding resistance of one phase", 0.0),
@@ -197,7 +198,7 @@ WHOLE = (
     "full_steps",
 )  # fmt: skip
 NEEDED = ("inertia_kg_m2", "rated_torque_nm", "rated_speed_rpm", "voltage_v", "encoder_counts")
-# A stepper's: what its file must have besides one form of the rated current, and what it may have.
+# A stepper's numbers: required ones, besides one form of the rated current, and optional ones.
 STEPPER_NEEDED = (
     "resistance_phase_ohm", "inductance_phase_h", "full_steps", "holding_torque_nm", "inertia_kg_m2", "voltage_v",
 )  # fmt: skip
@@ -205,21 +206,21 @@ STEPPER_MAY = (
     "detent_torque_nm", "torque_saturation", "coulomb_nm", "viscous_nm_s", "encoder_counts", "encoder_line_error_rad",
     "encoder_direction", "thermal_time_s",
 )  # fmt: skip
-OF_STEPPER = ("full_steps", "holding_torque_nm", "detent_torque_nm", "torque_saturation")  # no other motor has them
-# What a stepper's data sheet seldom has. Their common table has 125 % of the torque at 125 % of the current, and at
-# 150 % at most that. The drag is mostly that of eddy currents, a damping ratio of 0.045 of the rotor's swing in the
-# holding torque: that is what the QSH4218-47-28-040's torque at 1200 rpm, which its data sheet tells, leaves.
+OF_STEPPER = ("full_steps", "holding_torque_nm", "detent_torque_nm", "torque_saturation")  # only for steppers
+# Values that a stepper's data sheet seldom has. The common table has 125 % of the torque at 125 % of the current, and
+# at 150 % at most that. The drag is mostly that of eddy currents, a damping ratio of 0.045 of the rotor's swing in the
+# holding torque: this value fits the QSH4218-47-28-040's torque at 1200 rpm in its data sheet.
 DETENT_SHARE, SATURATION_SHARE, STEPPER_COULOMB_SHARE, STEPPER_DAMPING = 0.05, 0.05, 0.02, 0.045
-# What a data sheet seldom has: class values, of a rotor that is like the catalogue's.
+# Values that a data sheet seldom has: class values of a rotor similar to the catalogue's.
 COGGING_SHARE, COULOMB_SHARE, VISCOUS_SHARE = 0.01, 0.015, 0.005  # of the rated torque, at the rated speed
 ENCODER_LINE_ERROR, COMMUTATION_OFFSET = 2e-4, 0.02
 
 
 def find_motor(motor: str | Path | Motor) -> Motor:
-    """Return a motor by its name in the catalogue, by the path of a TOML file, or as it is.
+    """Return a motor by its name in the catalogue or the path of a TOML file; a `Motor` unchanged.
 
     Raises:
-        ValueError: For a name that none has, with those there are; MotorError for a file that describes no motor.
+        ValueError: For an unknown name, listing the known ones; MotorError for a file that does not describe a motor.
     """
     if isinstance(motor, Motor):
         return motor
@@ -237,7 +238,7 @@ def load_motor(path: Path) -> Motor:
     """Return the motor that a TOML file describes.
 
     Raises:
-        MotorError: If it cannot be read, lacks a number, or has one that no motor can have.
+        MotorError: If it cannot be read, lacks a number, or has an impossible one.
     """
     try:
         data = read_toml(path)
@@ -252,7 +253,7 @@ def load_motor(path: Path) -> Motor:
 
 
 def check_kind(kind: object) -> None:
-    """Raise MotorError for a kind of motor that there is not."""
+    """Raise MotorError for an unknown kind of motor."""
     if kind not in KINDS:
         meant = ", ".join(f"{name!r} ({what})" for name, what in KINDS.items())
         raise MotorError(f"kind is {kind!r}; it is one of {meant}")
@@ -360,7 +361,7 @@ def _built(name: str, title: str, kind: str, values: Mapping[str, float], source
 def _stepper(
     name: str, title: str, values: Mapping[str, float], sources: Mapping[str, str], curve: PullOut | None
 ) -> Motor:
-    """Return the stepper of checked numbers; its class values are those of data sheets that have them."""
+    """Return the stepper of checked numbers; its class values are from data sheets that have them."""
     for key in STEPPER_NEEDED:
         _one_of((key,), values)
     _refuse(
@@ -420,7 +421,6 @@ def _corner(R: float, L: float, psi_m: float, current: float, supply: float) -> 
 
 
 def _pull_out(row: Any, texts: Mapping[str, Any]) -> PullOut:
-    """Return a file's pull-out curve, checked."""
     keys = {"source", "supply_v", "speed_rpm", "torque_nm"}
     if not isinstance(row, Mapping) or set(row) != keys:
         raise MotorError(f"pull_out has {', '.join(sorted(keys))}, all of them")
@@ -458,7 +458,7 @@ def _one_of(quantity: tuple[str, ...], values: Mapping[str, float]) -> str:
 
 
 def _inductances(values: Mapping[str, float]) -> tuple[float, float]:
-    """Return L_d and L_q of a phase [H], which are the same where a file has one inductance."""
+    """Return L_d and L_q of a phase [H], which are equal if the file has one inductance."""
     key = _one_of((*INDUCTANCE, *INDUCTANCE_D), values)
     across = key.replace("_d_", "_q_")
     _refuse((each for each in INDUCTANCE_Q if each != across), values, f"does not go with {key}")
@@ -467,7 +467,7 @@ def _inductances(values: Mapping[str, float]) -> tuple[float, float]:
 
 
 def _torque_constant(kind: str, n_p: int, values: Mapping[str, float]) -> float | None:
-    """Return torque per ampere of peak current [N*m/A], None where it follows from the rated point."""
+    """Return torque per ampere of peak current [N*m/A], None if it follows from the rated point."""
     given = [key for key in TORQUE_CONSTANT if key in values]
     if len(given) > 1:
         raise MotorError(f"{' and '.join(given)} are two forms of the same number; keep one")
@@ -500,12 +500,12 @@ def _rated_current(values: Mapping[str, float], torque: float, k: float | None, 
 
 
 def is_extra_low(voltage: float) -> bool:
-    """Return whether a voltage [V] is of the class of 24 to 48 V drives, else that of drives on mains."""
+    """Return whether a voltage [V] belongs to the class of 24 to 48 V drives, not to that of drives on mains."""
     return voltage <= EXTRA_LOW_VOLTAGE
 
 
 def motors_of(kinds: Collection[str], voltage: float | None = None) -> dict[str, Motor]:
-    """Return the motors of the catalogue of one of these kinds, and of a voltage's class [V] if given, by name."""
+    """Return the catalogue's motors of these kinds, and of a voltage's class [V] if given, by name."""
     return {
         name: motor
         for name, motor in MOTORS.items()

@@ -30,7 +30,7 @@ _TORQUE = {
 _SPEED = {"rpm": 1.0, "krpm": 1e3, "1/min": 1.0, "min1": 1.0, "r/min": 1.0, "rad/s": 1.0 / RPM}
 _KRPM = {"1000rpm": 1.0, "1000min1": 1.0} | {name: 1e-3 * factor for name, factor in _SPEED.items()}
 _CURRENT, _VOLTAGE = {"A": 1.0, "mA": 1e-3}, {"V": 1.0, "mV": 1e-3}
-# Of each unit of a file the units of data sheets, without spaces, dots, hyphens and brackets.
+# For each unit of a file the units of data sheets, without spaces, dots, hyphens and brackets.
 UNITS: dict[str, dict[str, float]] = {
     "ohm": {"ohm": 1.0, "ohms": 1.0, "mohm": 1e-3, "kohm": 1e3},
     "H": {"H": 1.0, "mH": 1e-3, "uH": 1e-6},
@@ -45,7 +45,7 @@ UNITS: dict[str, dict[str, float]] = {
     "rpm/V": _per(_SPEED, _VOLTAGE) | {"KV": 1.0, "rad/Vs": 1.0 / RPM},
     "A": _CURRENT,
     "rpm": _SPEED,
-    "V": _VOLTAGE | {"VDC": 1.0, "VAC": 2.0**0.5},  # a link at mains is at the peak of their voltage
+    "V": _VOLTAGE | {"VDC": 1.0, "VAC": 2.0**0.5},  # a DC link on mains has the peak of their voltage
     "s": {"s": 1.0, "ms": 1e-3, "min": 60.0},
     "rad": {"rad": 1.0, "mrad": 1e-3, "deg": RPM / 6.0},
     "N*m*s/rad": _per(_TORQUE, {name: factor * RPM for name, factor in _SPEED.items()}) | {"Nms/rad": 1.0, "Nms": 1.0},
@@ -57,7 +57,7 @@ COUNTED = {
     "full_steps": {"steps": 1.0},
 }
 _SUFFIX = re.compile("_(ohm|h|a|v|s|rad|rpm|nm|nm_s|kg_m2|v_per_krpm|rpm_per_v)$")
-SHORT = {_SUFFIX.sub("", key): key for key in NUMBERS}  # without its unit, which is then with the value
+SHORT = {_SUFFIX.sub("", key): key for key in NUMBERS}  # names without the unit, which then comes with the value
 _FORMS = {"rms": ("rms", "eff"), "peak": ("peak", "pk")}
 _FORM = re.compile("(?<=[AV])(rms|eff|peak|pk)")
 _PLAIN = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻\u2212\u03bc\u00b5\u2019\u00d7", "0123456789--uu'x")
@@ -66,15 +66,15 @@ _TOLERANCE = re.compile(r"(?:±|\+/-)\s*[\d.,]+\s*%")
 
 
 def read_number(name: str, text: str) -> tuple[str, float]:
-    """Return the name of a number in a motor's file and its value there, of one that is typed as it is printed.
+    """Return the name and value in a motor's file of a number as printed in a data sheet.
 
     Args:
-        name: The number's name in a file, `inertia_kg_m2`, whose value may go without a unit; or without the unit,
-            `inertia`. Where a unit says RMS or peak (`9 Arms`) the name need not: `rated_current`.
+        name: The number's name in a file, `inertia_kg_m2`, for which the value's unit is optional; or without the unit,
+            `inertia`. If the unit has RMS or peak (`9 Arms`) the name need not: `rated_current`.
         text: Value and unit. A comma is a decimal point.
 
     Raises:
-        ValueError: For an unknown name or unit, which lists those that there are, or a value that is not a number.
+        ValueError: For an unknown name or unit, listing the known ones, or a value that is not a number.
     """
     plain = text.strip().removeprefix("DC ").translate(_PLAIN)
     plain = re.sub("[\u03a9\u2126]", "ohm", plain).replace("°", "deg")
@@ -100,7 +100,7 @@ def read_number(name: str, text: str) -> tuple[str, float]:
 
 
 def _key(name: str, form: str) -> str:
-    """Return the name in a file of a name that lacks its unit, or RMS and peak, which the value's unit has."""
+    """Return the file's name for a name without unit, RMS or peak, which are in the value's unit."""
     forms = [kind for kind, spelled in _FORMS.items() if form in spelled]
     known = NUMBERS.keys() | SHORT.keys()
     fitting = [key for short, key in SHORT.items() if _is_form_of(short, name)]
@@ -122,7 +122,7 @@ def _is_form_of(short: str, name: str) -> bool:
 
 
 def _decimal(name: str, digits: str) -> float:
-    """Return a number with a decimal point or comma; one that could be a group of thousands is refused."""
+    """Return a number with a decimal point or comma; one that could be a group of thousands is an error."""
     if re.fullmatch(r"[-+]?[1-9]\d{0,2},\d{3}", digits):
         raise ValueError(f"{name} = {digits}: is the comma a decimal point? write {digits.replace(',', '')} or "
                          f"{digits.replace(',', '.')}")  # fmt: skip
@@ -133,7 +133,7 @@ def _decimal(name: str, digits: str) -> float:
 
 
 def _factor(key: str, unit: str, text: str) -> float:
-    """Return the unit's factor; capitals do not matter, but for M, which is no milli."""
+    """Return the unit's factor; case does not matter, except for M, which is not milli."""
     known = COUNTED.get(key) or UNITS.get(NUMBERS[key].unit, {})
     folded = {name.casefold(): factor for name, factor in known.items()}
     if unit in known:

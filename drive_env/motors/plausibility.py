@@ -1,4 +1,4 @@
-"""Whether a motor's numbers contradict each other, as those of a data sheet do in a wrong unit or form."""
+"""Checks whether a motor's numbers contradict each other, as with a wrong unit or form of a data sheet."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from drive_env.motors import RPM, Motor
 
 
 class FigureBounds(NamedTuple):
-    """A figure that follows from a motor's numbers, its bounds, where they come from, and what is likely wrong outside.
+    """A figure computed from a motor's numbers, its bounds, their source, and the likely mistake outside.
 
     Attributes:
-        meaning: What it is; a text for `format` with the motor, its rated speed and speed without load [rpm].
-        kinds: Of motors that it is asked of; of a stepper the torque constant and the rated speed are computed.
-        figure: Of the motor, in `unit`.
+        meaning: Its description; a text for `format` with the motor, its rated speed and speed without load [rpm].
+        kinds: Kinds of motors that it applies to; a stepper's torque constant and rated speed are computed.
+        figure: Computes it for a motor, in `unit`.
     """
 
     meaning: str
@@ -32,12 +32,12 @@ _SERVO, _ALL = ("pmsm", "dc"), ("pmsm", "dc", "stepper")
 
 
 def no_load_speed(motor: Motor) -> float:
-    """Return the speed [rad/s] at which the back-EMF is the supply, with sines between terminals."""
+    """Return the speed [rad/s] at which the back-EMF equals the supply, with sinusoidal voltages."""
     return (motor.voltage / math.sqrt(3.0) if motor.kind == "pmsm" else motor.voltage) / (motor.n_p * motor.psi_m)
 
 
 def _mechanical_time(motor: Motor) -> float:
-    """Return R J / (k_t k_e) [ms], of a PMSM 2 R_s J / (3 (n_p psi_m)^2)."""
+    """Return R J / (k_t k_e) [ms], for a PMSM 2 R_s J / (3 (n_p psi_m)^2)."""
     return 1e3 * motor.copper_resistance * motor.inertia / motor.torque_constant**2
 
 
@@ -76,7 +76,7 @@ CHECKS = (
 
 
 def doubts(motor: Motor) -> list[str]:
-    """Return a sentence for each check that a motor fails, with the figure, its bounds and what is likely wrong."""
+    """Return a sentence for each check that a motor fails, with the figure, its bounds and the likely mistake."""
     found = []
     for check in CHECKS:
         value = check.figure(motor) if motor.kind in check.kinds else math.nan

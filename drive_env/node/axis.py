@@ -1,7 +1,7 @@
 """One axis of emulated drives as the node of a fieldbus sees it: its objects, one integer at a time, its emergencies.
 
-`LiveDictionary` works on all axes at once; a node needs a few values of one axis a thousand times a second, so here
-the way from an object to its place in the record is worked out once.
+`LiveDictionary` works on all axes at once; a node needs a few values of one axis a thousand times a second, so each
+object's place in the record is determined once here.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from drive_env.firmware.record import EMERGENCY_QUEUE, LANES
 class ObjectPort(NamedTuple):
     """Access to one object: its entry, its value, the check of a new value, the write of a checked one.
 
-    `event` names the event of a write, as in a binding. `write_text` takes a text or a domain, each byte of which is a
-    character; None where it cannot be written. `fit` returns the value that data beyond the object's range become, if
-    the device takes such; None for other objects.
+    `event` names the event of a write, as in a binding. `write_text` writes a text or a domain, each byte as a
+    character; None if the object has no writable text. `fit` limits data beyond the object's range if the device
+    accepts them; None for other objects.
     """
 
     entry: Entry
@@ -49,7 +49,7 @@ class ObjectPort(NamedTuple):
 
 
 class QueuedEmergency(NamedTuple):
-    """An emergency that an axis queued: row of the firmware's causes and the error register of that moment."""
+    """An emergency that an axis queued: row of the firmware's causes, and the error register at that time."""
 
     row: int
     error_register: int
@@ -70,7 +70,7 @@ class Axis:
         self._block, self._lane = divmod(number, LANES)
         self._records = objects.records[self._block : self._block + 1]
         memory = self._records.view(np.uint8).reshape(-1)
-        # Of one element a memoryview takes a third of the time that an array takes.
+        # Reading one element of a memoryview takes a third of the time of an array's.
         self._reals = memoryview(memory.view(np.float64))  # type: ignore[arg-type]
         self._integers = memoryview(memory.view(np.int32))  # type: ignore[arg-type]
         self._word = np.zeros(LANES, np.int64)
@@ -83,8 +83,8 @@ class Axis:
         self._other_scales = {name: self._place(name)[1] for name in objects.other_scales}
         self._error_register = self._place("error_register")[1]
         self._ports: dict[tuple[int, int], ObjectPort] = {}
-        self._texts: dict[tuple[int, int], str] = {}  # that were written, until the firmware starts anew
-        # Compiled now, for no axis: a master waits for an answer, and a silent network is noticed at once.
+        self._texts: dict[tuple[int, int], str] = {}  # written texts, until the firmware restarts
+        # Compiled now, with no axis selected: later a master would wait for its answer, and notice the silence.
         firmware = self._device.firmware
         firmware.write_events(self._records, cycle.MODE, self._word, np.zeros(LANES, bool))
         firmware.trip(self._records, self._lane, 0, firmware.communication_lost)
@@ -100,7 +100,7 @@ class Axis:
         return self._integers[self._error_register]
 
     def port(self, entry: Entry) -> ObjectPort:
-        """Return the way to an object; indices are those of axis 0."""
+        """Return the port of an object; indices are those of axis 0."""
         key = (entry.index, entry.sub)
         if key not in self._ports:
             self._ports[key] = self._make_port(entry)
@@ -116,18 +116,18 @@ class Axis:
         return [QueuedEmergency((word & 0xFF) - 1, word >> 8) for word in words]
 
     def store(self, values: Mapping[tuple[int, int], int]) -> None:
-        """Set the values that a restart restores; those of existing objects, within their range."""
+        """Set the values that a restart restores; only those of existing objects, limited to their range."""
         self._objects.store(self.number, values)
 
     def forget_texts(self) -> None:
-        """Bring texts back to the dictionary's, as a restart does."""
+        """Restore the dictionary's texts, as a restart does."""
         self._texts.clear()
 
     def trip(self, told: str = COMMUNICATION) -> bool:
         """Take the axis from operation enabled into fault because its network is lost; return whether it was there.
 
         Args:
-            told: The condition that its node tells of, whose code 603Fh then shows.
+            told: The condition that its node reports; 603Fh then shows its code.
         """
         firmware = self._device.firmware
         tripped = bool(firmware.trip(self._records, self._lane, 1, firmware.communication_lost))
@@ -138,7 +138,7 @@ class Axis:
 
     # --- inside ---------------------------------------------------------------------------------------------------
     def _place(self, field: str, part: int = 0) -> tuple[Any, int]:
-        """Return the memory that a field is in, and its index there."""
+        """Return the array of a field, and its index there."""
         real, place = self._device.firmware.layout.place(field, part)
         return self._reals if real else self._integers, place + self._lane
 
@@ -154,7 +154,7 @@ class Axis:
         return ObjectPort(entry, self._reader(code), check, self._writer(entry, code), code.event, fit=fit)
 
     def _fit(self, entry: Entry) -> Callable[[int], int] | None:
-        """Return the function that fits process data into the object's range, None without a rule of the device."""
+        """Return the function that limits process data to the object's range; None if the device has no such rule."""
         rule, highest = self._device.beyond_range.get((entry.index, entry.sub)), entry.high
         if rule is None or highest is None:
             return None
@@ -200,11 +200,11 @@ class Axis:
         return read
 
     def _part_reader(self, entry: Entry) -> Callable[[], int | str]:
-        """Return how a part of another object is read, as `LiveDictionary.part` reads it of all axes."""
+        """Return a reader of a part of another object, equal to `LiveDictionary.part` for all axes."""
         part, within = self._device.parts[entry.index, entry.sub], self.number % self._device.num_axes
         source = self.number if part.axis is None else self.number - within + part.axis
         if source >= self._objects.num_axes or (part.axis or 0) >= self._device.num_axes:
-            return lambda: entry.default  # of an axis that is not there
+            return lambda: entry.default  # for an axis that does not exist
         axis = self if source == self.number else Axis(self._objects, source)
         whole = axis.port(self._objects.entries.find(part.source(within)))
         return lambda: int(part.shown(whole.read()))
@@ -214,7 +214,7 @@ class Axis:
         if (entry.index, entry.sub) in {*self._device.parts, *self._device.shared_values}:
             read = self._unbound_reader(entry)
 
-            def write_if_new(raw: int) -> None:  # an image brings the same in each cycle
+            def write_if_new(raw: int) -> None:  # an image brings the same value in each cycle
                 if raw != read():
                     objects.write_checked(entry, raw, number)
 
@@ -236,7 +236,7 @@ class Axis:
         return float(code.factor(context))
 
     def _factor_now(self, code: Code) -> Callable[[], float]:
-        """Return a function of a code's present factor, which depends on scales that seldom change."""
+        """Return a function that returns a code's present factor; the scales that it depends on seldom change."""
         if not code.follows_scale:
             fixed = self._factor(code)
             return lambda: fixed
@@ -285,7 +285,7 @@ class Axis:
         return write
 
     def _scale_writer(self, entry: Entry) -> Callable[[int], None] | None:
-        """Return the writer of an object of the scale of positions, on which much depends; None for other objects."""
+        """Return the writer of an object of the position scale, which many others depend on; None for other objects."""
         if (entry.index, entry.sub) not in self._objects.scale_keys:
             return None
         return lambda raw: self._objects.write_checked(entry, raw, self.number)

@@ -1,7 +1,7 @@
-"""Block transfers of the SDO server: a sub-block of up to 127 segments goes before the other side answers (CiA 301).
+"""Block transfers of the SDO server: up to 127 segments, a sub-block, are sent before the other side answers (CiA 301).
 
-A lost segment costs its sub-block's rest: the receiver says the last segment that came in order, and the next
-sub-block begins after it. A CRC over all data closes the transfer, where both sides have one.
+A lost segment costs the rest of its sub-block: the receiver names the last segment received in order, and the next
+sub-block begins after it. A CRC over all data ends the transfer if both sides support it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from drive_env.dictionary.aborts import (
 SEGMENT = 7  # bytes
 LARGEST_BLOCK = 127  # segments
 LAST = 0x80  # first byte of a segment: no more follow
-# First bytes: requests of the client, and responses. Bits that vary are left out.
+# First bytes of requests of the client, and of responses, without the bits that vary.
 INITIATE, END, ACKNOWLEDGE, START = 0, 1, 2, 3  # bits 1 and 0
 DOWNLOAD, UPLOAD = 0xC0, 0xA0  # client command specifier 6 and 5
 DOWNLOAD_RESPONSE, UPLOAD_RESPONSE = 0xA0, 0xC0  # server command specifier 5 and 6
@@ -35,22 +35,22 @@ def crc(data: bytes) -> int:
 
 
 class Received(NamedTuple):
-    """The result of a download: the data, once they are whole."""
+    """The result of a download: the data, complete."""
 
     data: bytes
 
 
 class BlockDownload:
-    """A block transfer to the server.
+    """A block download to the server.
 
     Args:
         request: The client's initiate request.
-        block_size: Segments that the server takes at a time.
-        room: Bytes that the object takes at most.
+        block_size: Number of segments in a sub-block.
+        room: Maximum length of the object [bytes].
 
     Attributes:
-        takes_segments: Whatever comes now is a segment.
-        position: Sequence number of the segment that came last, in order or not; 0 at the beginning of a sub-block.
+        takes_segments: Every frame received now is a segment.
+        position: Sequence number of the last received segment, in order or not; 0 at the beginning of a sub-block.
     """
 
     specifier = DOWNLOAD >> 5
@@ -66,14 +66,14 @@ class BlockDownload:
         self._in_order = 0
 
     def initiated(self) -> bytes:
-        """Return the response to the initiate request; the server has a CRC."""
+        """Return the response to the initiate request, which announces that the server has a CRC."""
         return bytes((DOWNLOAD_RESPONSE | HAS_CRC | INITIATE,)) + self.multiplexor + bytes((self._block_size, 0, 0, 0))
 
     def request(self, data: bytes) -> bytes | Received | None:
-        """Take a segment, or the end.
+        """Handle a segment or the end request.
 
         Returns:
-            The response, None where the protocol has none yet; all data when they are whole: `ended` confirms them.
+            The response, None if the protocol has none yet, or all data when complete: `ended` confirms them.
 
         Raises:
             ObjectAccessError: 05040001h, 05040003h, 05040004h or 05040005h.
@@ -82,7 +82,7 @@ class BlockDownload:
 
     @staticmethod
     def ended() -> bytes:
-        """Return the response to an end whose data were taken."""
+        """Return the response to an end request whose data were accepted."""
         return bytes((DOWNLOAD_RESPONSE | END,)) + bytes(7)
 
     def _segment(self, data: bytes) -> bytes | None:
@@ -100,7 +100,7 @@ class BlockDownload:
                 raise ObjectAccessError(OUT_OF_MEMORY, f"{len(self._data)} bytes came, {self._room} have room")
         if not is_last and number < self._block_size:
             return None
-        # The last segment counts only where none before it is missing.
+        # The last segment counts only if none before it is missing.
         self.takes_segments = not (is_last and is_next)
         in_order, self._in_order, self.position = self._in_order, 0, 0
         return bytes((DOWNLOAD_RESPONSE | ACKNOWLEDGE, in_order, self._block_size)) + bytes(5)
@@ -115,14 +115,14 @@ class BlockDownload:
 
 
 class BlockUpload:
-    """A block transfer from the server.
+    """A block upload from the server.
 
     Args:
         request: The client's initiate request.
         content: All data.
 
     Raises:
-        ObjectAccessError: 05040002h for a block size that cannot be.
+        ObjectAccessError: 05040002h for an impossible block size.
     """
 
     specifier = UPLOAD >> 5
@@ -133,18 +133,18 @@ class BlockUpload:
         self.multiplexor = request[1:4]
         self._content = content
         self._block_size = _checked_size(request[4])
-        self._done = 0  # bytes that the client has
+        self._done = 0  # bytes that the client has confirmed
         self._sent = 0  # segments of this sub-block
         self.is_sending = False
         self._is_acknowledged = self._is_started = False
 
     def initiated(self) -> bytes:
-        """Return the response to the initiate request; the server has a CRC and says the size."""
+        """Return the response to the initiate request, which announces a CRC and the size."""
         size = len(self._content).to_bytes(4, "little")
         return bytes((UPLOAD_RESPONSE | HAS_CRC | HAS_SIZE | INITIATE,)) + self.multiplexor + size
 
     def next_segment(self) -> bytes | None:
-        """Return the next segment of the sub-block; None where the client is to answer."""
+        """Return the next segment of the sub-block; None when the client has to answer."""
         if not self.is_sending:
             return None
         begin = self._done + SEGMENT * self._sent
@@ -155,7 +155,7 @@ class BlockUpload:
         return bytes((self._sent | (LAST if is_last else 0),)) + part.ljust(SEGMENT, b"\0")
 
     def request(self, data: bytes) -> bytes | None:
-        """Take the client's start or an acknowledgement; return the response if there is one.
+        """Handle the client's start or acknowledgement; return the response, if there is one.
 
         Raises:
             ObjectAccessError: 05040001h, 05040002h or 05040003h.
@@ -171,13 +171,13 @@ class BlockUpload:
                 INVALID_SEQUENCE_NUMBER, f"segment {data[1]} is acknowledged, and {self._sent} were sent"
             )
         self._done += SEGMENT * data[1]
-        # Of no data at all there is one segment.
+        # Empty data have one segment, too.
         self._is_acknowledged = data[1] > 0 and self._done >= len(self._content)
         if not self._is_acknowledged:
             self._block_size = _checked_size(data[2])
             self._sent, self.is_sending = 0, True
             return None
-        checksum = crc(self._content)  # also for clients without one: python-canopen looks at it all the same
+        checksum = crc(self._content)  # also for clients without CRC: python-canopen checks it all the same
         unused = self._done - len(self._content)
         return bytes((UPLOAD_RESPONSE | unused << 2 | END,)) + checksum.to_bytes(2, "little") + bytes(5)
 
@@ -193,7 +193,7 @@ def _checked_size(size: int) -> int:
 
 
 def is_initiate(data: bytes) -> bool:
-    """Return whether a request of a block specifier begins a transfer."""
+    """Return whether a request with the block command specifier begins a transfer."""
     if data[0] & _SPECIFIER == UPLOAD:
         return data[0] & _COMMAND == INITIATE
-    return data[0] & END == 0  # bit 1 says whether the size is there
+    return data[0] & END == 0  # bit 1 says whether the size is given

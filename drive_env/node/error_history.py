@@ -11,19 +11,19 @@ GENERIC, COMMUNICATION, PROFILE = 0x01, 0x10, 0x20  # bits of 1001h
 
 
 class ErrorCondition(NamedTuple):
-    """A row: name as in the device's emergency table, bits of 1001h, and whether it lasts or is over when told."""
+    """A row: name as in the device's emergency table, bits of 1001h, and whether it lasts after being reported."""
 
     name: str
     error_register: int
     lasts: bool
 
 
-# Of the node, beside the causes of its axes (firmware/servo/causes.py).
+# Conditions of the node, in addition to the causes of its axes (firmware/servo/causes.py).
 CONDITIONS = {
     row.name: row
     for row in (
         ErrorCondition("communication_error", GENERIC | COMMUNICATION, False),
-        ErrorCondition("pdo_not_accepted", GENERIC | PROFILE, True),  # until a good one comes
+        ErrorCondition("pdo_not_accepted", GENERIC | PROFILE, True),  # until a good PDO comes
         ErrorCondition("pdo_too_short", GENERIC | COMMUNICATION, True),
         ErrorCondition("pdo_too_long", GENERIC | COMMUNICATION, True),
         ErrorCondition("heartbeat_lost", GENERIC | COMMUNICATION, True),  # until it comes again
@@ -36,11 +36,11 @@ CONDITIONS = {
 }
 
 
-# Of parts that a device may have (drive_env/devices/services.py); whose table of emergencies lacks them is silent.
+# Of services that a device may have (drive_env/devices/services.py); not reported if its emergency table lacks them.
 OPTIONAL_CONDITIONS = {
     row.name: row
     for row in (
-        ErrorCondition("sync_length", GENERIC | COMMUNICATION, True),  # until a good one comes
+        ErrorCondition("sync_length", GENERIC | COMMUNICATION, True),  # until a good SYNC comes
         ErrorCondition("sync_window_missed", GENERIC | COMMUNICATION, True),
     )
 }
@@ -51,7 +51,7 @@ class ErrorHistory:
 
     Args:
         depth: Number of sub-indices.
-        reads_0: A sub-index that holds no error yet reads 0.
+        reads_0: Whether a sub-index without an error yet reads 0.
     """
 
     def __init__(self, depth: int, *, reads_0: bool = False) -> None:
@@ -59,12 +59,12 @@ class ErrorHistory:
         self._errors: deque[int] = deque(maxlen=depth)
 
     def add(self, code: int, axis: int = 0, number: int = 0) -> None:
-        """Note an error; code 0000h is ignored. `number` is the device's own of the error."""
+        """Add an error; code 0000h is ignored. `number` is the device's own number of the error."""
         if code:
             self._errors.appendleft(code | axis << 16 | (number & 0x3F) << 24)
 
     def read(self, sub: int) -> int:
-        """Return a sub-index; 08000024h, or 0, for one that holds no error yet."""
+        """Return a sub-index; if it holds no error yet, abort 08000024h or 0."""
         if sub == 0:
             return len(self._errors)
         if sub > len(self._errors):

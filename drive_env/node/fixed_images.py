@@ -1,4 +1,4 @@
-"""The fields of a process image that a device has ready-made (`devices/image_rows.py`), and the objects behind them."""
+"""The fields of a device's ready-made process image (`devices/image_rows.py`), and their objects."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ class PackedFields:
     """The fields of an image and the objects behind them.
 
     Args:
-        fields: In the order of the bytes.
-        port: Returns the way to an object.
+        fields: The fields, in byte order.
+        port: Returns the port of an object.
 
     Attributes:
         size: Length of their data [bytes].
@@ -34,17 +34,17 @@ class PackedFields:
         self._fields = ReceivedFields([one for one in self._ports if one is not None])
 
     def pack(self) -> bytes:
-        """Return their present values; 0 for reserved fields."""
+        """Return the present values; 0 for reserved fields."""
         return self._layout.pack(
-            *(self._read(k) % (1 << bits) for k, bits in enumerate(self._bits))  # negative ones as their bits
+            *(self._read(k) % (1 << bits) for k, bits in enumerate(self._bits))  # negative ones in two's complement
         )
 
     def write(self, data: bytes) -> bool:
-        """Write each object that takes its value; return whether all did."""
+        """Write each field to its object; return whether all objects accepted their values."""
         return self._fields.write(self._received.unpack(data))
 
     def _port(self, field: ImageField) -> ObjectPort | None:
-        """Return the way to a field's object, which a write does not reach while the field is not taken."""
+        """Return the port of a field's object; it ignores writes while the field is not in use."""
         if field.key is None:
             return None
         port = self._find(*field.key)
@@ -62,7 +62,7 @@ class PackedFields:
         return self._named(value) if self._is_name[k] else value
 
     def _named(self, entry: int) -> int:
-        """Return the object that a mapping entry names; 0 for an entry without one, and for a missing object."""
+        """Return the key of the object that a mapping entry names; 0 for an entry without one, or a missing object."""
         index, sub, _ = mapping.parse(entry)
         try:
             value = self._find(index, sub).read()
@@ -72,7 +72,7 @@ class PackedFields:
 
 
 def _received(bits: int, port: ObjectPort | None) -> str:
-    """Return how `struct` reads a field of so many bits: an object's own in the lowest ones, the others passed over."""
+    """Return the `struct` format for a field of `bits` bits: the object's own are the lowest, others are skipped."""
     if port is None:
         return f"{bits // 8}x"
     own = min(port.entry.bits or 0, bits)

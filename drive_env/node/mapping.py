@@ -1,7 +1,7 @@
-"""PDO mapping: the meaning of an entry of 1600h...17FFh and 1A00h...1BFFh, and the rule by which it is changed.
+"""PDO mapping: the meaning of an entry of 1600h...17FFh and 1A00h...1BFFh, and the procedure for changing it.
 
-The rule is the manual's (sections 3.1.18 and 3.1.20): switch the PDO off (bit 31 of its COB-ID), set the number of
-entries to 0, write entries, set their number, switch the PDO on. What breaks it is refused with the codes that CiA 301
+The procedure is the manual's (sections 3.1.18 and 3.1.20): switch the PDO off (bit 31 of its COB-ID), set the number of
+entries to 0, write entries, set their number, switch the PDO on. Other writes are refused with the codes that CiA 301
 has for mapping: 06010000h, 06020000h, 06090011h, 06040041h, 06040042h.
 """
 
@@ -15,7 +15,7 @@ from drive_env.dictionary.entries import Entry
 
 MAX_BITS = 64
 DUMMIES = range(0x0002, 0x0008)  # CiA 301: data types of 8 bits and more, each as an object that a PDO can map
-# Characters of `struct` by width [bits], unsigned and signed: what travels in a PDO is whole bytes.
+# Characters of `struct` by width [bits], unsigned and signed: PDOs carry whole bytes.
 LAYOUT = {8: ("B", "b"), 16: ("H", "h"), 32: ("I", "i"), 64: ("Q", "q")}
 
 
@@ -30,10 +30,10 @@ def is_gap(raw: int) -> bool:
 
 
 def check_gaps(entry: Entry, raws: Sequence[int]) -> None:
-    """Check the gaps among these entries, written to sub-index 0; entries that are objects have whole bytes.
+    """Check the gaps among these entries, written to sub-index 0; objects have whole bytes.
 
     Raises:
-        ObjectAccessError: 06040041h if an object, or the mapping's end, does not lie on a byte's border; 06040042h for
+        ObjectAccessError: 06040041h if an object, or the mapping's end, does not lie on a byte boundary; 06040042h for
             a gap that is longer than any object.
     """
     bits = 0
@@ -81,7 +81,7 @@ def check_mappable(entry: Entry, raw: int, transmit: bool, find: Callable[[int, 
             error.abort_code, f"{entry.label} cannot map {index:04X}h:{sub:02X}: {error}"
         ) from error
     if index in DUMMIES and not transmit and mapped.bits == bits and bits in LAYOUT:
-        return mapped  # room of a frame that is passed over; only those are there that the EDS allows
+        return mapped  # dummy: bytes of a frame that are skipped; only those exist that the EDS allows
     if not fits_pdo(mapped, transmit) or mapped.bits not in LAYOUT:
         other = "TPDOs" if fits_pdo(mapped, True) else "RPDOs" if fits_pdo(mapped, False) else ""
         ways = f"{other} alone carry it" if other and mapped.bits in LAYOUT else "no PDO carries it"
@@ -94,7 +94,7 @@ def check_mappable(entry: Entry, raw: int, transmit: bool, find: Callable[[int, 
 
 
 def check_mapping(entry: Entry, raws: Sequence[int], transmit: bool, find: Callable[[int, int], Entry]) -> None:
-    """Raise 06020000h, 06040041h or 06040042h unless these entries together make a PDO; written to sub-index 0."""
+    """Raise 06020000h, 06040041h or 06040042h unless these entries, written to sub-index 0, form a valid PDO."""
     bits = sum(check_mappable(entry, raw, transmit, find).bits or 0 for raw in raws)
     if bits > MAX_BITS:
         raise ObjectAccessError(

@@ -1,4 +1,4 @@
-"""The axes of one node: which of the emulated drives' they are, and actions on all of them together."""
+"""The axes of one node: which of the emulated axes they are, and actions on all of them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class NodeAxes(Sequence[Axis]):
     Args:
         drives: The emulated drives.
         first_axis: Number of the device's first axis among the drives'.
-        spare: Drives of the node's last axes, those that `drives` have none for.
+        spare: Drives of the node's last axes if `drives` have too few.
 
     Raises:
         ValueError: For axes that the drives do not have.
@@ -62,20 +62,20 @@ class NodeAxes(Sequence[Axis]):
             axis.forget_texts()
 
     def trip(self, told: str = COMMUNICATION) -> bool:
-        """Take each axis from operation enabled into fault, as its network is lost; return whether one was there.
+        """Take each axis from operation enabled into fault, since its network is lost; return whether any was there.
 
         Args:
-            told: The condition that the node tells of.
+            told: The condition that the node reports.
         """
-        tripped = [axis.trip(told) for axis in self._axes]  # all of them, not those up to the first that was
+        tripped = [axis.trip(told) for axis in self._axes]  # a list: all of them trip, not only those up to the first
         return any(tripped)
 
     def engrave(self, key: tuple[int, int], raw: int) -> None:
-        """Set a factory value of an object of all axes: a serial number."""
+        """Set the factory value of an object of all axes, such as a serial number."""
         for objects, mask in self._sets:
             objects.engrave(key, raw, mask)
 
     def store(self, values: Sequence[Mapping[tuple[int, int], int]]) -> None:
-        """Set the values that a restart restores, axis by axis; those of existing objects, within their range."""
+        """Set the values that a restart restores, axis by axis: those of existing objects, limited to their range."""
         for axis, stored in zip(self._axes, values, strict=True):
             axis.store(stored)

@@ -14,10 +14,10 @@ WRITTEN = ("rw", "rwr", "rww")  # CiA 306: objects that are written and read bac
 
 
 class OwnObjects(Protocol):
-    """Objects that a node has once, whatever its axes: those of communication.
+    """Objects that a node has once for all axes: those of communication.
 
     Attributes:
-        commands: Those whose write commands something, by index and sub-index.
+        commands: Objects whose write is a command, by index and sub-index.
     """
 
     commands: dict[tuple[int, int], Callable[[int], None]]
@@ -26,15 +26,15 @@ class OwnObjects(Protocol):
         """Return whether an object is one of them."""
 
     def port(self, entry: Entry) -> ObjectPort:
-        """Return the way to one."""
+        """Return the port of one of them."""
 
 
 class NodeDictionary:
     """Ports of all objects.
 
     Args:
-        device: Whose dictionary it is.
-        entries: What its EDS says.
+        device: The device.
+        entries: Its dictionary from the EDS.
         module: Objects of the module.
         axes: The axes, in order.
     """
@@ -49,7 +49,7 @@ class NodeDictionary:
         self._states = {key for key, binding in device.bindings.items() if binding.field not in parameters}
 
     def port(self, index: int, sub: int) -> ObjectPort:
-        """Return the way to an object.
+        """Return the port of an object.
 
         Raises:
             ObjectAccessError: 06020000h if there is no such object, 06090011h if it has no such sub-index.
@@ -62,8 +62,9 @@ class NodeDictionary:
     def section(self, entry: Entry) -> str | None:
         """Return the section of the store that a parameter belongs to; None for an object that is not a parameter.
 
-        What a receive PDO can carry is a command or a set-point: a drive that found an old one after power-on would
-        act on it. Nor is it one what the firmware itself sets: a counter, or a latch that is armed.
+        An object that a receive PDO can carry is a command or a set-point: a drive that restored an old one after
+        power-on would act on it. An object that the firmware itself sets (a counter, an armed latch) is no parameter
+        either.
         """
         roles = self._device.canopen.objects
         if (entry.index, entry.sub) in (roles.get("bit_rate"), roles.get("node_id")):
@@ -87,7 +88,7 @@ class NodeDictionary:
         return "profile" if base in cia402.PROFILE_AREAS else f"motor {axis}"
 
     def _commands(self, key: tuple[int, int]) -> bool:
-        """Return whether an object commands something."""
+        """Return whether a write of an object is a command."""
         axis_0 = self._device.locate(key[0])[1]
         if (axis_0, key[1]) == cia402.OUTPUTS_MASK:
             return False

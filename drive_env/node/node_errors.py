@@ -1,7 +1,7 @@
 """A node's errors on any fieldbus: error register (1001h), history (1003h), emergencies, reactions.
 
-An emergency is an event here: code, error register and additional bytes. How it travels, and when it may, is the
-fieldbus' own, and so is the change of the node's state.
+An emergency is an event here: code, error register and additional bytes. The fieldbus decides how and when to send it,
+and how the node's state changes.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ NETWORK_LOST = ("communication_error", "heartbeat_lost")  # conditions that may 
 
 
 class EmergencySink(Protocol):
-    """Takes a node's emergencies.
+    """Receives a node's emergencies.
 
     Attributes:
         told: Error register of the last message that was queued; 0 before the first.
@@ -41,15 +41,15 @@ class NodeErrors:
     """Errors of a node and its axes.
 
     Args:
-        device: Whose node it is.
+        device: The node's device.
         axes: Its axes.
-        depth: Errors that the history keeps.
-        sink: Takes the emergencies.
-        flush: Sends what may be sent at a time [s].
-        react: Does what the fieldbus' state does of a fault of an axis.
+        depth: Number of errors in the history.
+        sink: Receives the emergencies.
+        flush: Sends the emergencies that may be sent at a time [s].
+        react: Changes the fieldbus' state after a fault of an axis.
 
     Attributes:
-        conditions: Conditions of communication that last, by whose they are.
+        conditions: Lasting conditions of communication, by their `key`.
         history: 1003h.
     """
 
@@ -69,15 +69,15 @@ class NodeErrors:
         self._flush = flush
         self._react = react
         self._told_last = 0  # axis of the last emergency
-        self._last_of: dict[Hashable, int] = {}  # last axis whose a condition is, for 1001h
-        self._module_told: dict[int, float] = {}  # row of a cause that is the module's -> when it was told
+        self._last_of: dict[Hashable, int] = {}  # last axis with a condition, for 1001h
+        self._module_told: dict[int, float] = {}  # row of a cause of the whole module -> when it was reported
         self.conditions: dict[Hashable, ErrorCondition] = {}
         quirks = device.canopen.quirks
         self.history = ErrorHistory(depth, reads_0=quirks.empty_history_reads_0)
         self._told_bits = ~quirks.unused_register_bits
 
     def add_objects(self, objects: NodeObjects) -> None:
-        """Let 1001h and, where the device has it, 1003h show them."""
+        """Connect 1001h and, if the device has it, 1003h."""
         objects.readers[ERROR_REGISTER, 0] = self.register
         subs = objects.subs(ERROR_HISTORY)
         if subs:
@@ -86,7 +86,7 @@ class NodeErrors:
             objects.commands[ERROR_HISTORY, 0] = self.history.write
 
     def restart(self) -> None:
-        """Forget waiting emergencies, and all conditions; the history stays."""
+        """Forget waiting emergencies and all conditions; the history stays."""
         self._sink.clear()
         self.conditions.clear()
 
@@ -101,12 +101,12 @@ class NodeErrors:
         return register
 
     def _of_axis(self, number: int, register: int) -> int:
-        """Return an axis' share of 1001h; some devices show that it is not the first one's."""
+        """Return an axis' share of 1001h; some devices mark there that it is not the first axis."""
         bit = self._device.canopen.quirks.further_axis_bit
         return register | bit if number and register else register
 
     def condition(self, name: str, now: float, key: Hashable = None) -> None:
-        """Report a condition of the bus at `now` [s], unless it is known already; `key` says whose it is.
+        """Report a condition of the bus at `now` [s], unless it was already reported for this `key` (its source).
 
         CiA 301: 1003h has the errors of the emergencies.
         """
@@ -129,7 +129,7 @@ class NodeErrors:
         self._flush(now)
 
     def condition_if_known(self, name: str, now: float) -> None:
-        """Report a condition that a device's table of emergencies may lack, since the standard leaves it open."""
+        """Report a condition that a device's emergency table may lack, since the standard leaves it optional."""
         if name in self._device.emergencies:
             self.condition(name, now)
 
@@ -139,12 +139,12 @@ class NodeErrors:
             for emergency in take():
                 self._tell_of(axis, emergency, now)
         if self._sink.told and not self.register():
-            # CiA 301: masters that were sent an error are sent 0000h when no error is left, however it ended.
+            # CiA 301: a master that received an error gets 0000h when no error is left, however it ended.
             reset = self._device.emergencies[self._device.firmware.causes[FAULT_RESET].name]
             self._sink.push(reset.of_axis(self._told_last), 0)
 
     def _tell_of(self, axis: Axis, queued: QueuedEmergency, now: float) -> None:
-        """Pass an axis' emergency on, with the error register of its moment, and react to a fault."""
+        """Send an axis' emergency, with the error register at that time, and react to a fault."""
         cause = self._device.firmware.causes[queued.row]
         if queued.row == FAULT_RESET:
             self.conditions.clear()
@@ -159,11 +159,11 @@ class NodeErrors:
             self._react()
 
     def _is_of_axes(self, name: str) -> bool:
-        """Return whether a lost network is an error of each axis: the device's table has none of the node for it."""
+        """Return whether a lost network is an error of each axis: the device's table has no row of the node for it."""
         return name in NETWORK_LOST and name not in self._device.emergencies
 
     def _concerned(self) -> list[int]:
-        """Return the axes whose error a lost network is: those in operation, or in fault by it just now; else all."""
+        """Return the axes in error after a lost network: those in operation, or just tripped by it; otherwise all."""
         firmware = self._device.firmware
         register = firmware.causes[firmware.communication_lost].error_register
         concerned = [
@@ -179,9 +179,9 @@ class NodeErrors:
         return emergency.extra[0] if self._device.canopen.quirks.history_tells_number else 0
 
     def _is_told_of_module(self, row: int, now: float) -> bool:
-        """Return whether another axis has told of the same thing of the module in this cycle, and note it if not.
+        """Return whether another axis has reported the same event of the module in this cycle, and note it if not.
 
-        A switch of the whole module is one event for all of its axes, and CiA 301 wants one message for an event.
+        An event of the whole module is one event for all of its axes, and CiA 301 demands one message per event.
         """
         if not self._device.is_of_module(self._device.firmware.causes[row].name):
             return False

@@ -1,7 +1,7 @@
 """The objects that a node has once for all axes: 1000h to 1FFFh, and others that its device's data name.
 
 Each write is checked by the rule of its object before it changes anything; the owner of the service behind an object is
-notified of the change. Which rules there are is the fieldbus' own.
+notified of the change. The fieldbus provides the rules.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ class NodeObjects:
     """Values of the node's own objects.
 
     Args:
-        device: Whose they are.
+        device: The device.
         entries: Its dictionary.
-        changed: Told the index of an object that was written.
+        changed: Called with the index of an object that was written.
 
     Attributes:
         readers: Objects whose value comes from a service.
@@ -60,7 +60,7 @@ class NodeObjects:
         return 0x1000 <= entry.index <= 0x1FFF or (entry.index, entry.sub) in self._own
 
     def restore(self, node_id: int, stored: Mapping[Key, int]) -> None:
-        """Give the communication objects the values of a node that starts: the stored ones, else the factory's."""
+        """Set the communication objects as at the start of a node: the stored values, otherwise the factory's."""
         factory = self.factory(node_id)
         for entry in self._entries:
             if 0x1000 <= entry.index <= 0x1FFF:
@@ -68,7 +68,7 @@ class NodeObjects:
                 self._values[key] = stored.get(key, factory[key])
 
     def factory(self, node_id: int) -> Mapping[Key, int | str]:
-        """Return the factory's values of all objects, of the axes too; COB-IDs follow the node ID."""
+        """Return the factory's values of all objects, also of the axes; COB-IDs contain the node-ID."""
         return _factory(self._entries.path, node_id)
 
     def set(self, role: str, raw: int | str) -> None:
@@ -76,13 +76,13 @@ class NodeObjects:
         self._values[self._device.canopen.objects[role]] = raw
 
     def value(self, index: int, sub: int = 0) -> int:
-        """Return a number; 0 for an object that this device does not have."""
+        """Return a number; 0 for an object that this device lacks."""
         raw: int | str = self._values.get((index, sub), 0)
         assert isinstance(raw, int), "a text is not a number"
         return raw
 
     def port(self, entry: Entry) -> ObjectPort:
-        """Return the way to one of these objects."""
+        """Return the port of one of these objects."""
         key = (entry.index, entry.sub)
         values = self._values
         read: Callable[[], int | str] = self.readers.get(key) or (lambda: values[key])
@@ -98,7 +98,7 @@ class NodeObjects:
         def checked(raw: int) -> None:
             check_limits(entry, raw)
             check_supported(self._device, entry)
-            # A device's data name the objects of the first axis; those of the others take the same values.
+            # A device's data name objects of the first axis; those of the others accept the same values.
             allowed = self._device.allowed_values.get((self._device.locate(entry.index)[1], entry.sub))
             if allowed is not None:
                 check_allowed(entry, np.array([raw]), allowed)
@@ -132,7 +132,7 @@ class NodeObjects:
         return None
 
     def _fixed(self, entry: Entry) -> int:
-        """Return the bits that are set whatever is written."""
+        """Return the bits that are set in every written value."""
         return 0
 
 

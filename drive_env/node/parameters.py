@@ -19,16 +19,16 @@ class Parameters:
     """Stored parameters of a node.
 
     Args:
-        device: Whose they are.
+        device: The device.
         objects: The node's own objects.
         axes: The node's axes.
         dictionary: All of its objects.
         store: The memory.
-        node_id: Tells the node's number, which COB-IDs of the factory follow.
-        works: Told before something is stored, which takes time.
+        node_id: Returns the node-ID, which the factory's COB-IDs contain.
+        works: Called before values are stored, which takes time.
 
     Attributes:
-        replaces: Section -> another that its saving makes void.
+        replaces: Section -> another section that is deleted when it is saved.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class Parameters:
         self.replaces: dict[str, str] = {}
 
     def add_commands(self) -> None:
-        """Let 1010h and 1011h store and restore the groups that the device has."""
+        """Make 1010h and 1011h store and restore the groups that the device has."""
         canopen = self._device.canopen
         for sub, names in canopen.store_groups.items():
             save, load = partial(self.save, names), partial(self.load, names)
@@ -60,13 +60,13 @@ class Parameters:
             commands[RESTORE, sub] = signed_command(canopen.load_signature, CANNOT_BE_STORED, load)
 
     def save(self, names: tuple[str, ...]) -> None:
-        """Save sections as they are now; values equal to the factory's follow the factory, so COB-IDs the node ID."""
+        """Save the present values of sections; factory values are not stored, so that COB-IDs follow the node-ID."""
         factory = self._objects.factory(self._node_id())
         changed: dict[str, Section] = {name: {} for name in names}
         for entry in self._dictionary.entries:
             name = self._dictionary.section(entry)
             key = (entry.index, entry.sub)
-            if name in changed and key in factory:  # what EtherCAT alone has is the master's to set
+            if name in changed and key in factory:  # objects that only EtherCAT has are set by the master
                 raw = self._dictionary.port(*key).read()
                 assert isinstance(raw, int), "a parameter is a number"
                 if name == "bus" or raw != factory[key]:
@@ -74,11 +74,11 @@ class Parameters:
         self._commit(changed)
 
     def load(self, names: tuple[str, ...]) -> None:
-        """Bring sections back to the factory's values, from the next reset on."""
+        """Restore sections to the factory's values, from the next reset on."""
         self._commit({name: {} for name in names})
 
     def prepare_restart(self) -> None:
-        """Give the axes the values that a restart restores."""
+        """Set the axes' values for the next restart."""
         values: list[dict[tuple[int, int], int]] = [{} for _ in self._axes]
         for entry in self._dictionary.entries:
             section = self._store.sections.get(self._dictionary.section(entry) or "")
@@ -88,11 +88,11 @@ class Parameters:
         self._axes.store(values)
 
     def check(self, path: Path | None, other: Callable[[str, tuple[int, int], int], bool] = lambda *_: False) -> None:
-        """Raise ValueError if a value of the store fits no object.
+        """Raise ValueError if a stored value fits no object.
 
         Args:
             path: The store's file.
-            other: Checks a value that is no object's, by section, key and raw; returns whether it is such a one.
+            other: Checks a value that belongs to no object, by section, key and raw; returns whether it knows it.
         """
         for name, section in self._store.sections.items():
             for key, raw in section.items():
@@ -105,7 +105,7 @@ class Parameters:
     def _commit(self, changed: dict[str, Section]) -> None:
         for name in [self.replaces[name] for name in changed if name in self.replaces]:
             if name in self._store.sections:
-                changed[name] = {}  # what is stored last counts
+                changed[name] = {}  # the last stored section counts
         self._works()
         try:
             self._store.save(changed)

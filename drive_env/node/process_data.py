@@ -1,7 +1,7 @@
-"""Process data of a node: objects that travel together, packed one behind the other, on whatever fieldbus.
+"""Process data of a node: objects that are sent together, packed one after the other, on any fieldbus.
 
-Each field acts by itself: where an object does not take its value it stays as it was, and the other fields act all the
-same. A stop is so never void for what travels beside it.
+Each field acts by itself: an object that does not accept its value keeps the old one, and the other fields act all the
+same. So a stop never fails because of another field.
 """
 
 from __future__ import annotations
@@ -15,28 +15,30 @@ from drive_env.node import mapping
 from drive_env.node.axis import ObjectPort
 
 _MASK, _ENABLES = cia402.COMMANDS["enable operation"]
-_RANK = {"mode": 1, "controlword": 2}  # all else is 0
+_RANK = {"mode": 1, "controlword": 2}  # all others have 0
 
 
 class ReceivedFields:
     """Fields of the data that a node receives, and the objects behind them.
 
     Args:
-        ports: The way to the object of each field.
+        ports: The port of each field's object.
     """
 
     def __init__(self, ports: Sequence[ObjectPort]) -> None:
         order = sorted(range(len(ports)), key=lambda k: _RANK.get(ports[k].event, 0))
-        # Masters repeat the mode in every frame: the present mode again is no write, which some drives would refuse.
+        # Masters repeat the mode in every frame: the present mode again is not written, since some drives would refuse
+        # it.
         rows = [(k, ports[k], ports[k].read if ports[k].event == "mode" else None) for k in order]
         self._plan = [(k, port.fit, repeats, port.check, port.write) for k, port, repeats in rows]
         self._controlwords = [k for k in order if ports[k].event == "controlword"]
 
     def write(self, values: Sequence[int]) -> bool:
-        """Write each value that its object takes; return whether all were taken.
+        """Write each value that its object accepts; return whether all were accepted.
 
-        Whatever the order of the fields, controlwords that stop act first. Then come set-points, modes, and the
-        controlwords that enable operation: one that starts a move so finds the target of the same frame.
+        Regardless of the order of the fields, controlwords that stop act first. Then come set-points, modes, and
+        controlwords that enable operation, so that a controlword which starts a move acts on the target of the same
+        frame.
         """
         plan = self._plan
         stops = [k for k in self._controlwords if values[k] & _MASK != _ENABLES]
@@ -56,10 +58,10 @@ class ReceivedFields:
 
 
 class MappedObjects:
-    """Objects in the order in which they travel.
+    """Objects in the order in which they are sent.
 
     Args:
-        fields: The ways to them; for a gap, its length [bits]. Objects begin on a byte.
+        fields: Their ports; for a gap, its length [bits]. Objects begin on a byte.
 
     Attributes:
         size: Length of their data [bytes].
@@ -83,9 +85,9 @@ class MappedObjects:
         return len(self._readers)
 
     def pack(self) -> bytes:
-        """Return their values as they are now."""
+        """Return the present values."""
         return self._layout.pack(*[read() for read in self._readers])
 
     def write(self, data: bytes) -> bool:
-        """Write each that takes its value; return whether all did."""
+        """Write each object that accepts its value; return whether all did."""
         return self._fields.write(self._layout.unpack(data))

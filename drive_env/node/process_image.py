@@ -1,11 +1,11 @@
 """Process data as one packed image in each direction, and the objects of its mapping (ETG.1000.6, 5.6.7.4).
 
 Sync manager 2 carries what the master sends (outputs), sync manager 3 what the drive answers (inputs). 1C12h and 1C13h
-name the mapping objects that each carries, and those the objects, one behind the other without gaps. An image is not
-bound to the 8 bytes of a frame on CAN. Some devices have images that are ready-made (`fixed_images.py`), and no mapping
-objects: 1C12h and 1C13h name one of these. Entries change while their number is 0 (1600h:00), assignments while theirs
-is (1C12h:00). Whether a mapping is assigned meanwhile does not matter: some masters take the assignment away first,
-others write it last. An entry without an object (0000h:00) is a gap.
+name the mapping objects of each, and those name the objects, which follow each other without gaps. An image is not
+limited to the 8 bytes of a CAN frame. Some devices have ready-made images (`fixed_images.py`) and no mapping objects:
+1C12h and 1C13h name one of these. Entries can be changed while their number is 0 (1600h:00), assignments while theirs
+is (1C12h:00). A mapping may stay assigned meanwhile: some masters remove the assignment first, others only write it
+last. An entry without an object (0000h:00) is a gap.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from drive_env.node.node_dictionary import NodeDictionary
 from drive_env.node.process_data import MappedObjects
 
 SYNC_MANAGER_TYPES = 0x1C00
-OUTPUTS, INPUTS = 0x1C12, 0x1C13  # what sync managers 2 and 3 carry
+OUTPUTS, INPUTS = 0x1C12, 0x1C13  # the objects that sync managers 2 and 3 carry
 SYNCHRONISATION = (0x1C32, 0x1C33)  # of both
-ASSIGNMENTS = {OUTPUTS: range(0x1600, 0x1800), INPUTS: range(0x1A00, 0x1C00)}  # and the mappings that each can
+ASSIGNMENTS = {OUTPUTS: range(0x1600, 0x1800), INPUTS: range(0x1A00, 0x1C00)}  # and the mappings that each can carry
 
 
 class ImageObjects:
-    """The objects of a process image, and the image as they make it; for use after `connect`.
+    """The objects of a process image, and the image that they define; for use after `connect`.
 
     Args:
-        device: Whose they are.
+        device: The device.
         entries: Its dictionary.
-        may_change: Tells whether the image may be changed now; a node of EtherCAT allows it in pre-operational alone.
+        may_change: Returns whether the image may be changed now; on EtherCAT only in pre-operational.
 
     Raises:
         ValueError: For a device without sync managers.
@@ -56,7 +56,7 @@ class ImageObjects:
         self._entries = entries
         self._roles = device.roles
         carried = {direction: [i for i in indices if entries.has(i)] for direction, indices in ASSIGNMENTS.items()}
-        # Of CANopen's PDOs, which the device may have too, each has a communication parameter 200h below its mapping.
+        # CANopen's PDOs, which the device may have too, each have a communication parameter 200h below their mapping.
         self._mappings = {
             index: direction
             for direction, indices in carried.items()
@@ -69,7 +69,7 @@ class ImageObjects:
         self._values = dict(self._factory)
 
     def connect(self, port: Callable[[int, int], ObjectPort]) -> None:
-        """Take the objects that are mapped from the node's dictionary, by index and sub-index."""
+        """Connect the mapped objects to their ports in the node's dictionary, by index and sub-index."""
         self._port_of = port
         self._configure()
 
@@ -85,13 +85,13 @@ class ImageObjects:
         return self._images[INPUTS].size
 
     def write_outputs(self, data: bytes) -> bool:
-        """Let the master's outputs take effect; an object that does not take its value stays as it was.
+        """Apply the master's outputs; an object that does not accept its value keeps the old one.
 
         Returns:
-            Whether each took its value.
+            Whether each accepted its value.
 
         Raises:
-            ValueError: For data of another length than the image; a sync manager passes none on.
+            ValueError: For data of another length than the image; a sync manager never passes such on.
         """
         image = self._images[OUTPUTS]
         if len(data) != image.size:
@@ -103,11 +103,11 @@ class ImageObjects:
         return self._images[INPUTS].pack()
 
     def restart(self) -> None:
-        """Bring the factory's image back, as a device does that is switched on."""
+        """Restore the factory's image, as a device does at power-on."""
         self._values.update(self._factory)
         for direction, role in ((OUTPUTS, Role.OUTPUT_IMAGE), (INPUTS, Role.INPUT_IMAGE)):
             key = self._roles.get(role)
-            if key is not None:  # a register of the device's own says which image it begins with
+            if key is not None:  # a register of the device selects the image at power-on
                 raw = self._port_of(*key).read()
                 assert isinstance(raw, int), "the number of an image"
                 self._values[direction, 1] = raw
@@ -119,7 +119,7 @@ class ImageObjects:
         return (entry.index, entry.sub) in self._values
 
     def port(self, entry: Entry) -> ObjectPort:
-        """Return the way to one of them."""
+        """Return the port of one of them."""
         key = (entry.index, entry.sub)
 
         def write(raw: int) -> None:
@@ -129,10 +129,11 @@ class ImageObjects:
         return ObjectPort(entry, lambda: self._values[key], partial(self._check, entry), write)
 
     def write_whole(self, index: int, raws: Sequence[int]) -> None:
-        """Replace an object's sub-indices from 1 on by some; a refusal leaves them as they were.
+        """Replace an object's sub-indices from 1 on; if it is refused, they are unchanged.
 
         Raises:
-            ObjectAccessError: As for writes one by one, number of entries 0 before and their number after.
+            ObjectAccessError: As for single writes, with the number of entries set to 0 before and to their number
+                after.
         """
         before = dict(self._values)
         try:
@@ -147,7 +148,7 @@ class ImageObjects:
         self._configure()
 
     def writes_whole(self, index: int) -> bool:
-        """Return whether an object's number of entries can be written: mapping and assignment."""
+        """Return whether an object's number of entries can be written, as of a mapping or an assignment."""
         return index in ASSIGNMENTS or index in self._mappings
 
     def mapped(self, direction: int) -> list[tuple[int, list[int]]]:
@@ -162,7 +163,6 @@ class ImageObjects:
 
     # --- inside -----------------------------------------------------------------------------------------------------
     def _configure(self) -> None:
-        """Read the settings from the objects."""
         self._images = {direction: self._image(direction) for direction in ASSIGNMENTS}
 
     def _image(self, direction: int) -> MappedObjects | PackedFields:
@@ -199,7 +199,6 @@ class ImageObjects:
                 raise ObjectAccessError(VALUE_RANGE, f"{entry.label} cannot be {index:04X}h; there is {known}")
 
     def _can_carry(self, direction: int, index: int) -> bool:
-        """Return whether there is an image of that number, for that way."""
         fixed = self._fixed.get(index)
         return fixed.is_output == (direction == OUTPUTS) if fixed else self._mappings.get(index) == direction
 
@@ -225,19 +224,19 @@ class ImageObjects:
 
 
 class ProcessImage(ImageObjects):
-    """The process image of a device with sync managers, in front of the axes of an emulated one.
+    """The process image of a device with sync managers, connected to emulated axes.
 
     Args:
         drives: The emulated drives.
         first_axis: Number of the device's first axis among the drives'.
-        may_change: Tells whether the image may be changed now.
+        may_change: Returns whether the image may be changed now.
 
     Raises:
         ValueError: For a device without sync managers, or axes that the drives do not have.
 
     Attributes:
-        dictionary: All objects by index and sub-index; the image's among them.
-        commands: Objects whose write commands something: none.
+        dictionary: All objects by index and sub-index, including the image's.
+        commands: Objects whose write is a command: empty.
     """
 
     def __init__(

@@ -1,7 +1,7 @@
 """The SDO server: expedited, segmented and block transfers (CiA 301, 7.2.4).
 
-A request and the time go in, the response comes out: eight bytes, or None where the protocol has no response. The
-segments of a block upload are fetched one by one, when the bus can take them.
+A call takes a request and the time, and returns the response: eight bytes, or None if the protocol has no response. The
+segments of a block upload are fetched one by one, when the bus can carry them.
 """
 
 from __future__ import annotations
@@ -56,11 +56,11 @@ class SdoServer:
     Args:
         port: Finds an object by index and sub-index; raises ObjectAccessError.
         timeout: Time [s] after which an open transfer is given up.
-        block_size: Segments that it takes at a time in a block transfer; 0: it has none.
-        longest_text: Bytes of a string or domain that can be written; 0: none can.
+        block_size: Segments of a sub-block in block transfers; 0: no block transfers.
+        longest_text: Longest string or domain that can be written [bytes]; 0: not writable.
 
     Attributes:
-        block: The block transfer that is open, if there is one.
+        block: The open block transfer; None if there is none.
     """
 
     def __init__(
@@ -74,8 +74,8 @@ class SdoServer:
         self.block: BlockDownload | BlockUpload | None = None
         self._block_port: ObjectPort | None = None  # of a block download
         self._block_size_said: int | None = None
-        self._last: float  # of a block transfer [s], from its beginning on
-        self._leftover = 0  # segment of a sub-block that was aborted: what follows it in turn is no request
+        self._last: float  # last activity of a block transfer [s]
+        self._leftover = 0  # next segment of an aborted sub-block: segments from it on are not requests
         self._services = {
             INITIATE_UPLOAD: self._initiate_upload,
             INITIATE_DOWNLOAD: self._initiate_download,
@@ -84,7 +84,7 @@ class SdoServer:
         }
 
     def request(self, data: bytes, now: float) -> bytes | None:
-        """Return the response to a request that came at `now` [s]; a frame of other than 8 bytes is no request."""
+        """Return the response to a request received at `now` [s]; frames of other than 8 bytes are ignored."""
         if len(data) != 8:
             return None
         specifier = data[0] >> 5
@@ -104,12 +104,12 @@ class SdoServer:
                 self._open = None
                 return self._initiate_block(data, now)
         except ObjectAccessError as error:
-            # Of a segment, which carries no multiplexor, it is the transfer's.
+            # A segment has no multiplexor: that of its transfer applies.
             is_segment = specifier in (DOWNLOAD_SEGMENT, UPLOAD_SEGMENT)
             multiplexor = self._open.multiplexor if is_segment and self._open else bytes(3) if is_segment else data[1:4]
             self._open = None
             return _abort(multiplexor, error.abort_code)
-        # Block transfer where the server has none, a step of one that is not open, or an unknown specifier.
+        # A block transfer without server support, a step of a transfer that is not open, or an unknown specifier.
         self._open = None
         names_object = self._block_size == 0 or specifier not in (BLOCK_UPLOAD, BLOCK_DOWNLOAD)
         return _abort(data[1:4] if names_object else bytes(3), UNKNOWN_COMMAND)
@@ -124,7 +124,7 @@ class SdoServer:
         return segment
 
     def expire(self, now: float) -> bytes | None:
-        """Return the abort of a transfer whose client has been silent for too long, None without such a transfer."""
+        """Return the abort of a transfer whose client has been silent for too long; None if there is none."""
         if self.block is not None:
             if now - self._last < self._timeout - EPSILON:
                 return None
@@ -212,14 +212,14 @@ class SdoServer:
         check_readable(entry)
         content = encode(entry, port.read())
         upload = BlockUpload(data, content)
-        if 0 < data[5] >= len(content):  # the protocol switch threshold: the client asks for the other protocol then
+        if 0 < data[5] >= len(content):  # protocol switch threshold: short values go by the other protocol
             return self._begin_upload(entry, data[1:4], content, now)
         self.block = upload
         return upload.initiated()
 
     @staticmethod
     def _is_of_block(block: BlockDownload | BlockUpload, data: bytes) -> bool:
-        """Return whether a request goes on with the open block transfer; any other replaces it."""
+        """Return whether a request continues the open block transfer; any other request replaces it."""
         return block.takes_segments or (data[0] >> 5 == block.specifier and not is_initiate(data))
 
     def _go_on(self, block: BlockDownload | BlockUpload, data: bytes, now: float) -> bytes | None:
@@ -245,9 +245,9 @@ class SdoServer:
         return block.ended()
 
     def _is_leftover(self, data: bytes) -> bool:
-        """Return whether a frame is a segment that was on its way when its sub-block was aborted.
+        """Return whether a frame is a segment that was under way when its sub-block was aborted.
 
-        Its first byte might be that of a write, and its data name an object.
+        It could be mistaken for a write, since its bytes may look like a command and an object.
         """
         number = data[0] & 0x7F
         if number != self._leftover + 1:
@@ -257,7 +257,7 @@ class SdoServer:
         return True
 
     def _room(self, entry: Entry) -> int:
-        """Return how many bytes an object takes at most."""
+        """Return the maximum length of an object [bytes]."""
         return self._longest_text if entry.bits is None else size_of(entry)
 
     def _check_length(self, entry: Entry, size: int, expected: int | None = None) -> None:
@@ -275,7 +275,7 @@ class SdoServer:
             )
 
     def _transfer(self, data: bytes, now: float, *, is_upload: bool) -> Transfer:
-        """Return the open transfer that a segment belongs to, which proves that its client lives."""
+        """Return the open transfer of a segment, and restart its time-out."""
         transfer = self._open
         if transfer is None or transfer.is_upload != is_upload:
             raise ObjectAccessError(UNKNOWN_COMMAND, "a segment of a transfer that was not initiated")
@@ -286,7 +286,7 @@ class SdoServer:
 
 
 def encode(entry: Entry, value: int | str) -> bytes:
-    """Return a value as the wire carries it."""
+    """Return a value as bytes on the bus."""
     if isinstance(value, str):
         return value.encode("latin-1", "replace")
     assert entry.bits is not None, "a number has a width"
@@ -294,7 +294,7 @@ def encode(entry: Entry, value: int | str) -> bytes:
 
 
 def size_of(entry: Entry) -> int:
-    """Return the length [bytes] of an object; 0 for a text, which is as long as it is."""
+    """Return the length [bytes] of an object; 0 for a text, whose length varies."""
     return 0 if entry.bits is None else (entry.bits + 7) // 8
 
 
@@ -309,11 +309,11 @@ def check_length(entry: Entry, size: int) -> None:
 
 
 def take(port: ObjectPort, content: bytes) -> None:
-    """Write received bytes, of the object's length, to an object; ObjectAccessError if it does not take them."""
+    """Write received bytes, of the object's length, to an object; ObjectAccessError if it does not accept them."""
     if port.entry.bits is None:
         if port.write_text is None:
             raise ObjectAccessError(CANNOT_BE_STORED, f"{port.entry.label} is a text that cannot be written")
-        port.write_text(content.decode("latin-1"))  # each byte a character, whatever it means
+        port.write_text(content.decode("latin-1"))  # each byte is a character, of whatever encoding
         return
     raw = int.from_bytes(content, "little", signed=port.entry.signed)
     port.check(raw)

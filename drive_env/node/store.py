@@ -1,7 +1,7 @@
-"""The node's non-volatile memory: sections of parameters in a file that is always whole.
+"""The node's non-volatile memory: sections of parameters in a file that is never half written.
 
-A section that is there holds every value of its group that differs from nothing: what it does not name is at its
-factory value. A section that is not there was never saved or restored.
+A saved section holds the changed values of its group; objects that it does not name have their factory value. A missing
+section was never saved, or was restored.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ class Store:
     """Sections of a device, in a file if there is a path.
 
     Attributes:
-        sections: What is stored.
-        loses_power: The power fails in the middle of each save.
+        sections: The stored values.
+        loses_power: Whether the power fails in the middle of each save.
 
     Args:
         path: The file; it need not exist.
-        device: Name of the device, which the file must be of.
-        commissioned: Sections of a memory into which nothing was saved.
+        device: Name of the device, which the file must name, too.
+        commissioned: Sections of a memory before the first save.
 
     Raises:
         ValueError: If the file was not written by this class for this device.
@@ -50,11 +50,11 @@ class Store:
             self.sections |= _parse(path, device)
 
     def save(self, changed: Mapping[str, Section]) -> None:
-        """Replace sections; all of them are saved or, if the file cannot be written, none.
+        """Replace sections: all of them, or none if the file cannot be written.
 
         Raises:
             OSError: If the file cannot be written.
-            PowerLostError: If the power fails meanwhile; what was stored before is stored still.
+            PowerLostError: If the power fails meanwhile; the previous values remain stored.
         """
         sections = {**self.sections, **changed}
         if self._path is not None:
@@ -77,12 +77,12 @@ class Store:
 
 
 def _unfinished(path: Path) -> Path:
-    """Return the file in which a new content is written before it replaces the old one."""
+    """Return the temporary file that replaces the old one once it is complete."""
     return path.with_name(path.name + ".new")
 
 
 def write_whole(path: Path, text: str) -> None:
-    """Write a file so that after a kill or a power failure it has the old content or the new, never a mixture."""
+    """Write a file so that after a kill or a power failure it has the old or the new content, never a mixture."""
     new = _unfinished(path)
     with new.open("w", encoding="utf-8") as file:
         file.write(text)

@@ -1,1 +1,1 @@
-"""Machines that are drawn: distributions of their parameters, supply, temperatures, bus and faults."""
+"""Random machines: distributions of their parameters, supply, temperatures, bus and faults."""

@@ -1,4 +1,4 @@
-"""Faults as randomisation: with which probability an episode has one, which, when, for how long and how badly."""
+"""Random faults: the probability that an episode has one, and which, when, for how long and how badly."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ class RandomFaults:
     """The distribution of faults in a set of distributions.
 
     probability: Of an episode that it has a fault, 0...1.
-    names: Which there may be, all as likely.
-    at: Earliest and latest begin, from the episode's [s].
-    duration: Shortest and longest [s]; None lasts until the episode ends.
+    names: The possible faults, with equal probability.
+    at: Earliest and latest begin, from the episode's start [s].
+    duration: Shortest and longest [s]; None: until the episode ends.
     ranges: Low and high of a fault's parameter by "fault.parameter"; the others have their defaults.
     """
 
@@ -31,11 +31,11 @@ class RandomFaults:
     ranges: Mapping[str, Range] = field(default_factory=dict)
 
     def draw(self, chance: Callable[[str], float], width: float) -> Order | None:
-        """Return the fault of an episode, None where it has none.
+        """Return the fault of an episode, or None.
 
         Args:
-            chance: Returns the share of chance 0...1 that belongs to a name.
-            width: How far the curriculum has opened, 0...1: by so much the probability is multiplied.
+            chance: Returns the random number 0...1 of a name.
+            width: Width of the curriculum, 0...1, by which the probability is multiplied.
         """
         if chance("faults") >= self.probability * width:
             return None
@@ -55,7 +55,7 @@ class RandomFaults:
         return Order(row.name, begin, duration=duration, parameters=given)
 
     def table(self) -> dict[str, Any]:
-        """Return it as a TOML table has it."""
+        """Return it as a TOML table."""
         found: dict[str, Any] = {"probability": self.probability, "names": list(self.names), "at": list(self.at)}
         if self.duration is not None:
             found["duration"] = list(self.duration)
@@ -63,7 +63,7 @@ class RandomFaults:
 
 
 def check_ranges(where: str, faults: RandomFaults) -> None:
-    """Raise ValueError for a probability, time or range that cannot be."""
+    """Raise ValueError for an impossible probability, time or range."""
     if not 0.0 <= faults.probability <= 1.0:
         raise ValueError(f"{where}: probability must lie in 0...1, not {faults.probability:g}")
     for name, ends in (("at", faults.at), ("duration", faults.duration)):

@@ -1,8 +1,8 @@
 """Domain randomisation as data: distributions of a machine's parameters, supply, temperatures, bus and faults.
 
 A set of distributions is a TOML file (`distributions/`, one for every load); a curriculum widens it from the default
-machine to the whole range. A machine depends on the generator that it is drawn with, and on nothing else: a parameter's
-share of chance belongs to its name, so that adding a distribution to a set changes no other parameter.
+machine to the whole range. A machine depends only on its generator: a parameter's random number is derived from its
+name, so that adding a distribution to a set changes no other parameter.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 SHIPPED = Path(__file__).parent / "distributions"
 
-# What is drawn beside the parameters of `drives.machine`: unit and default, None where it is the drives' own.
+# Drawn quantities besides the parameters of `drives.machine`: unit and default, None if it is the drives' own.
 BESIDE: dict[str, tuple[str, float | None]] = {
     "supply.voltage": ("V", None),
     "start.winding": ("degC", 25.0),
@@ -46,20 +46,20 @@ BESIDE: dict[str, tuple[str, float | None]] = {
     "bus.lost_sync": ("1", 0.0),
 }
 
-# What an episode with faults tells: which of the table, counted from 1, 0 for none; when it begins [s].
+# Values of an episode with faults: number in the table, from 1, 0 without a fault; begin [s].
 FAULT_VALUES = ("fault.number", "fault.at")
 
 LAWS = ("uniform", "loguniform", "normal", "choice")
 _KEYS = {"uniform": ("low", "high"), "loguniform": ("low", "high"), "normal": ("mean", "deviation"),
          "choice": ("values",)}  # fmt: skip
 _OPTIONAL = {"uniform": (), "loguniform": (), "normal": ("low", "high"), "choice": ("weights",)}
-_TRIES = 20  # draws until a machine is one that can be stepped
+_TRIES = 20  # draws until a machine can be stepped
 
 
 class Law(NamedTuple):
-    """How a parameter is distributed: absolute in its own unit, or as multiples of its default.
+    """The distribution of a parameter: absolute in its unit, or as multiples of its default.
 
-    law: "uniform" or "loguniform" over low...high; "normal" with mean and deviation, cut off at low and high; "choice"
+    law: "uniform" or "loguniform" over low...high; "normal" with mean and deviation, limited to low and high; "choice"
         of values, with weights.
     relative: Whether the numbers are multiples of the default.
     """
@@ -74,10 +74,10 @@ class Law(NamedTuple):
     weights: tuple[float, ...] = ()
 
     def value(self, share: float, default: float, width: float = 1.0) -> float:
-        """Return the value at a share of chance 0...1, drawn towards the default where width is below 1.
+        """Return the value for a random number 0...1, closer to the default if width is below 1.
 
-        A width of 0 is the default, 1 the whole distribution; in between the distance from the default shrinks: its
-        logarithm under "loguniform", the probability of another value than the default under "choice".
+        Width 0 gives the default, 1 the whole distribution; in between the distance from the default shrinks: its
+        logarithm for "loguniform", the probability of a value other than the default for "choice".
         """
         scale = default if self.relative else 1.0
         if self.law == "choice":
@@ -112,14 +112,14 @@ class Law(NamedTuple):
 
 
 class Curriculum(NamedTuple):
-    """When the ranges open: `stage` over training steps, and the part of it in which a group or parameter widens."""
+    """Schedule of the ranges: `stage` over training steps, and the interval in which a group or parameter widens."""
 
     steps: tuple[float, ...] = (0.0,)
     stage: tuple[float, ...] = (1.0,)
     opens: Mapping[str, tuple[float, float]] = {}
 
     def stage_at(self, steps: float) -> float:
-        """Return the stage 0...1 after so many environment steps; between the points it is linear."""
+        """Return the stage 0...1 after this number of environment steps, interpolated linearly."""
         return float(np.interp(steps, self.steps, self.stage))
 
     def width(self, name: str, stage: float) -> float:
@@ -133,8 +133,7 @@ class Curriculum(NamedTuple):
 class Distributions:
     """Distributions by the name of the parameter, and the curriculum that widens them.
 
-    Names are those of `drives.machine.parameters` and of `BESIDE`. `faults` is the distribution of faults, None without
-    any.
+    Names are those of `drives.machine.parameters` and of `BESIDE`. `faults` is the distribution of faults, or None.
     """
 
     def __init__(
@@ -152,8 +151,8 @@ class Distributions:
 
         Tables: `include`, names of sets that come first; `parameters`, name -> distribution; `curriculum` with `steps`
         and `stage`, and `opens`, group or parameter -> [from, to] in stages; `faults` with `probability`, `names` (of
-        faults or groups), `at`, `duration` and `ranges`, as `RandomFaults` has them. A law false takes an included
-        one away, and so does `faults = false`.
+        faults or groups), `at`, `duration` and `ranges`, as in `RandomFaults`. `false` as a distribution removes an
+        included one, and so does `faults = false`.
 
         Raises:
             ValueError: For an unknown set, distribution or key, with the known ones, or an invalid number.
@@ -170,7 +169,7 @@ class Distributions:
         return _shipped_set(str(source))
 
     def of_machine(self, parameters: Collection[str]) -> Distributions:
-        """Return the set without parameters that a machine does not have, as those of another motor."""
+        """Return the set without parameters that a machine lacks, e.g. those of another motor."""
         laws = {name: law for name, law in self.laws.items() if name in parameters or name in BESIDE}
         return Distributions(laws, self.curriculum, self.faults)
 
@@ -179,19 +178,19 @@ class Distributions:
 
         Args:
             rng: The environment's generator; exactly one number is taken from it, whatever the set.
-            defaults: Default by name, as `drives.machine.parameters` has them; only these are drawn, and a distribution
-                of `BESIDE` that has no default here is left out.
+            defaults: Default by name, as in `drives.machine.parameters`; only these are drawn, and distributions of
+                `BESIDE` without a default here are left out.
             stage: Stage of the curriculum, 0 (the defaults) to 1 (whole ranges).
 
         Raises:
-            ValueError: For a stage out of range, or a law of a parameter that the machine does not have.
+            ValueError: For a stage out of range, or a distribution of a parameter that the machine lacks.
         """
         return self.draw_with_fault(rng, defaults, stage)[0]
 
     def draw_with_fault(
         self, rng: np.random.Generator, defaults: Mapping[str, float], stage: float = 1.0
     ) -> tuple[dict[str, float], Order | None]:
-        """Draw one machine as `draw` does, and the fault of its episode, None if it has none."""
+        """Draw one machine as `draw` does, and the fault of its episode, or None."""
         if not 0.0 <= stage <= 1.0:
             raise ValueError(f"stage of the curriculum must lie in 0...1, not {stage:g}")
         key = np.uint64(rng.integers(0, 2**64, dtype=np.uint64))
@@ -209,7 +208,7 @@ class Distributions:
         return drawn, self.faults.draw(partial(_chance, key), self.curriculum.width("faults", stage))
 
     def to_toml(self) -> str:
-        """Return the set as TOML that `load` reads, included ones written out."""
+        """Return the set as TOML for `load`, with included sets written out."""
         lines = ["[parameters]"]
         for name, law in self.laws.items():
             lines.append(f'"{name}" = {{ {", ".join(f"{k} = {_toml(v)}" for k, v in law.table().items())} }}')
@@ -254,7 +253,7 @@ class RandomMachines(Saved):
                              f"{', '.join(self._defaults)}")  # fmt: skip
         self.values = {name: values.copy() for name, values in self._defaults.items()}
         self._orders: list[Order | None] = [None] * machines
-        self._given: list[str] = []  # parameters without a law that have been given: an episode later they are default
+        self._given: list[str] = []  # given parameters without a distribution: default again in the next episode
         if distributions.faults is not None:
             for name in distributions.faults.names:
                 drives.faults.check(Order(name))
@@ -267,26 +266,26 @@ class RandomMachines(Saved):
         stage: float = 1.0,
         given: Mapping[str, ArrayLike] | None = None,
     ) -> None:
-        """Draw the machines where the mask is true, put them to rest and switch their drives on anew.
+        """Draw the machines where the mask is true, put them to rest and restart their drives.
 
-        Afterwards `values` has the present value of everything by name, each of shape (num_machines,). A machine that
-        cannot be stepped (a resonance too fast) is drawn again with its own generator.
+        Afterwards `values` has all present values by name, each of shape (num_machines,). A machine that cannot be
+        stepped (a resonance too fast) is drawn again with its own generator.
 
         Args:
             rngs: The machines' generators.
             where: Machines.
-            stage: Of the curriculum, 0...1.
-            given: Values that stand in place of the drawn or default ones until these machines are drawn again, by
-                name: one, or one per machine.
+            stage: Stage of the curriculum, 0...1.
+            given: Values that replace drawn or default ones until these machines are drawn again, by name: one, or one
+                per machine.
 
         Raises:
-            ValueError: If none of many draws of a machine can be, or for a value that is given and cannot be.
+            ValueError: If many draws of a machine are all impossible, or a given value is.
         """
         fixed = self._checked(given or {})
         machine = self._drives.machine
         mask = np.ones(self._drives.num_machines, bool) if where is None else np.asarray(where, bool)
         if self.distributions.faults is not None:
-            machine.clear_fault(where=mask)  # the next machine is drawn sound
+            machine.clear_fault(where=mask)  # the next machine is drawn without faults
         for name in self._given:
             self.values[name] = np.where(mask, self._defaults[name], self.values[name])
         self._given += [name for name in fixed if name not in self.distributions.laws and name not in self._given]
@@ -300,7 +299,7 @@ class RandomMachines(Saved):
         except ValueError:
             for lane in map(int, np.flatnonzero(mask)):
                 self._set_one(lane, rngs[lane], stage, fixed)
-        # Supply before the reset, which charges the link from it; temperatures after: it sets them to 25 degC.
+        # Supply before the reset, which charges the link from it; temperatures after it, since it sets them to 25 degC.
         axes = np.repeat(mask, self._drives.num_axes // self._drives.num_machines)
         supply = np.where(axes, self._per_axis("supply.voltage"), machine.supply)
         machine.supply = supply[machine.links]
@@ -313,7 +312,7 @@ class RandomMachines(Saved):
         self.plan_faults(mask)
 
     def plan_faults(self, where: Mask) -> None:
-        """Schedule the faults of the episodes that begin where the mask is true; `redraw` does, a reset ends them."""
+        """Schedule the faults of starting episodes where the mask is true; `redraw` calls it, a reset ends them."""
         if self.distributions.faults is None:
             return
         for lane in map(int, np.flatnonzero(where)):
@@ -324,7 +323,7 @@ class RandomMachines(Saved):
                 continue
             try:
                 self._drives.faults.add(order, np.arange(len(where)) == lane)
-            except ValueError:  # a payload with which this machine cannot be stepped: it stays sound
+            except ValueError:  # a payload with which this machine cannot be stepped: it gets no fault
                 continue
             self.values["fault.number"][lane] = 1.0 + list(FAULTS).index(order.name)
             self.values["fault.at"][lane] = order.at
@@ -375,12 +374,12 @@ def shipped() -> list[str]:
 
 
 def laws_of(load: str, device: Device, parameters: Collection[str]) -> Distributions:
-    """Return the set that ships for a load, with the distributions that differ for the device's machines.
+    """Return the shipped set of a load, adapted to the device's machines.
 
     Args:
         load: Name of a load that has a set.
         device: The device.
-        parameters: Names of what its machines have; the set's others are left out.
+        parameters: Names of its machines' parameters; others of the set are left out.
     """
     own = "stepper" if device.gains.is_open_loop else device.firmware_name
     if own not in shipped():
@@ -543,9 +542,9 @@ def _toml(value: Any) -> str:
 
 # --- chance -----------------------------------------------------------------------------------------------------------
 def shares_of_chance(key: np.uint64 | NDArray[np.uint64], marks: NDArray[np.uint64]) -> Floats:
-    """Return shares of chance in [0, 1) of keys with marks: splitmix64 of both (Steele, Lea, Flood 2014).
+    """Return random numbers in [0, 1) for keys and marks: splitmix64 of both (Steele, Lea, Flood 2014).
 
-    Any chance of a key can be computed alone and in any order: one does not change another.
+    Each number can be computed alone and in any order.
     """
     with np.errstate(over="ignore"):
         z = key + marks * np.uint64(0x9E3779B97F4A7C15)
@@ -556,5 +555,4 @@ def shares_of_chance(key: np.uint64 | NDArray[np.uint64], marks: NDArray[np.uint
 
 
 def _chance(key: np.uint64, name: str) -> float:
-    """Return the share of chance of one name."""
     return float(shares_of_chance(key, np.array([zlib.crc32(name.encode())], np.uint64))[0])

@@ -1,4 +1,4 @@
-"""The present knowledge of the axes: whether they are live, where they are, how fast, and since when."""
+"""State of the axes as last observed: whether each is live, its position, its speed, and when it was seen."""
 
 from __future__ import annotations
 
@@ -21,45 +21,47 @@ if TYPE_CHECKING:
     from drive_env.safety.watched_drives import WatchedDrives
 
 
-BASELINE = 0.008  # s at least between two positions that tell a speed
-# Rev, though so many counts at least, and of the way that the speed explains: more is a new zero, not a movement.
+BASELINE = 0.008  # s, the shortest time between two positions from which a speed is computed
+# A step in homing is a new zero, not a movement, if it exceeds JUMP_TURNS [rev] (at least JUMP_COUNTS [inc]) plus
+# JUMP_SHARE times the step that the speed explains.
 JUMP_TURNS, JUMP_COUNTS, JUMP_SHARE = 0.003, 1.5, 2.0
 CURRENT_MEMORY = 0.03  # s
 
 
 class Axes:
-    """The present knowledge of every axis; arrays have shape (num_axes,).
+    """State of every axis as last observed; arrays have shape (num_axes,).
 
     Args:
         drives: The drives.
 
     Attributes:
-        lock: Held while what is known changes, and while a stop begins or takes a step.
-        epoch: Grows with every controlword: samples from before tell nothing of what it did.
-        is_armed: Whether everything is ready for motion: watchdogs on, limits lent, every axis seen.
+        lock: Held while this state changes, and while a stop begins or takes a step.
+        epoch: Grows with every controlword: samples of an earlier epoch do not show its effect.
+        is_armed: Whether everything is ready for motion: watchdogs set, limits lent to the drives, every axis seen.
         live: Whether an axis may turn, by its statusword, or by a frame that could have enabled it.
-        assumed: Live, until a sample of this epoch shows otherwise.
-        in_flight: An enabling frame was sent, and nothing confirms yet that the drive received it.
+        assumed: Whether an axis is taken for live until a sample of this epoch shows its state.
+        in_flight: Whether an enabling frame was sent and the drive has not yet confirmed it.
         lost: Axes that could not be proved off.
-        outside: How far outside its limits an axis was when it became live, or since [inc]; -1: not seen yet.
-        aim: Axis to the target of pp before, from which relative moves go on [inc].
-        moves: Whether a move in pp was started to it in the present mode.
-        led: Where set-points of csp have led it, in the present mode [inc]; nan before the first.
-        demand: Demand of the position [inc].
-        demand_seen: When it came last [s].
-        asked_speed: What set-points of a velocity add up to [inc/s]; of rows that are played, the next one's.
-        asked_current: What those of a torque add up to [unit of 6077h].
-        velocity: As the drive says [inc/s].
-        told_speed: As the drive says in another unit, by the scale of its positions [inc/s].
-        speed_count: Increments a second of a count of 606Ch; nan where its unit tells none.
-        speed: From positions [inc/s]; of a drive without any, as it says.
-        has_scale: Whether the drive says how many increments a revolution has.
+        outside: The least distance outside its limits since the axis became live [inc]; -1 before the first sample.
+        aim: Axis to its previous target in pp, the base of relative moves [inc].
+        moves: Whether a move to `aim` was started in the present mode.
+        led: The last set-point of csp in the present mode [inc]; nan before the first.
+        demand: Position demand [inc].
+        demand_seen: When `demand` was last received [s].
+        asked_speed: The sum of the velocity set-points [inc/s]; of the next row while rows are played.
+        asked_current: The sum of the torque set-points [unit of 6077h].
+        velocity: As the drive reports it [inc/s].
+        told_speed: As a drive with another unit of speed reports it, converted by the scale of positions [inc/s].
+        speed_count: Increments a second of a count of 606Ch; nan if its unit cannot be converted.
+        speed: Computed from positions [inc/s]; as reported by a drive without positions.
+        has_scale: Whether the drive reports its increments per revolution.
         mean_current: Over the last 30 ms [unit of 6077h].
-        seen: When the statusword came last [s].
-        mode_written: When the program last wrote the mode of operation, or the drive's own mode that must fit it [s].
-        clock: The time of lockstep [s].
-        velocity_object: What shows the speed: 606Ch, or 6044h of a drive of vl alone.
-        is_counted: Whether 606Ch counts what 6064h counts, per second.
+        seen: When the statusword was last received [s].
+        mode_written: When the program last wrote the mode of operation, or the manufacturer's mode that must match it
+            [s].
+        clock: Time in lockstep [s].
+        velocity_object: The object that shows the speed: 606Ch, or 6044h of a drive of vl alone.
+        is_counted: Whether the unit of 606Ch is that of 6064h per second.
     """
 
     def __init__(self, drives: WatchedDrives) -> None:
@@ -97,18 +99,18 @@ class Axes:
         self.clock = 0.0
         self.rotor = RotorAngle(count)
         self._placed = np.zeros(count, bool)  # whether a position was seen
-        self._kept: Floats | None = None  # where the rotors were before what moves the scale was written [rev]
+        self._kept: Floats | None = None  # rotor angles before a write that changes the scale [rev]
         self.has_scale = np.zeros(count, bool)
-        self._position_time = np.full(count, -math.inf)  # when it was there [s]
+        self._position_time = np.full(count, -math.inf)  # of `position` [s]
         self._current_time = np.zeros(count)  # [s]
-        # The position and its time from which the speed is reckoned.
+        # The position and its time from which the speed is computed.
         self._base = np.zeros(count, np.int64)
         self._base_time = np.full(count, -math.inf)
         self._step_speed = np.zeros(count)  # of the newest two positions [inc/s]
-        self._was_enabled = np.zeros(count, bool)  # at the look before
+        self._was_enabled = np.zeros(count, bool)  # in the sample before
 
     def now(self) -> float:
-        """Return the time by which the axes are seen [s]: that of lockstep where time waits."""
+        """Return the time of samples [s]: that of the cycles in lockstep, otherwise the monotonic clock's."""
         return self.clock if self._drives.time_waits else time.monotonic()
 
     @property
@@ -129,7 +131,7 @@ class Axes:
         return axes
 
     def newest_speed(self) -> Floats:
-        """Return the speeds [inc/s]: those that the drives say, for positions tell them some milliseconds late."""
+        """Return the speeds that the drives report [inc/s]: a speed from positions is some milliseconds late."""
         return np.where(np.abs(self.told_speed) > np.abs(self.velocity), self.told_speed, self.velocity)
 
     def assume(self, axes: Mask) -> None:
@@ -144,25 +146,25 @@ class Axes:
             self.live |= axes
 
     def forget_motion(self, axes: Mask) -> None:
-        """Note that no set-point of a position moves some axes any more: a new one must be given."""
+        """Note that no position set-point moves these axes any more: the program must give a new one."""
         self.moves = self.moves & ~axes
         self.led = np.where(axes, math.nan, self.led)
 
     def take_for_off(self, axes: Mask) -> None:
-        """Count axes as off: they were proved to be."""
+        """Mark axes as off, once their statuswords have proved it."""
         with self.lock:
             for mask in (self.live, self.assumed, self.in_flight):
                 mask &= ~axes
 
     def keep_place(self) -> None:
-        """Have the next `place` find the rotors where they are now: samples until then may be of another scale."""
+        """Keep the present rotor angles for the next `place`: samples until then may be in another scale."""
         self._kept = self.rotor.turns(self.position)
 
     def place(self, position: Integers, scale: Floats) -> None:
-        """Take positions [inc] and scales [inc/rev] that were read: changes of scale or zero have not moved the rotors.
+        """Store positions [inc] and scales [inc/rev] just read; a change of scale or zero has not moved the rotors.
 
         Args:
-            position: What 6064h shows now.
+            position: The present values of 6064h.
             scale: Increments of a revolution; nan where the drive does not say.
         """
         turns, self._kept = self._kept, None
@@ -179,8 +181,8 @@ class Axes:
 
         Args:
             rows: The samples, each object of shape (rows, num_axes).
-            epoch: That of the moment when they were asked for.
-            where: Axes that they are of.
+            epoch: The epoch in which they were requested.
+            where: The axes that they belong to.
 
         Returns:
             Whether homing has set a new zero, so that limits count from there.
@@ -201,7 +203,7 @@ class Axes:
                     self.aim.pop(int(axis), None)
             self.seen = np.where(where, now, self.seen)
         if CURRENT in rows:
-            # By the time since the axes were seen last: a run has a row for each cycle, a look one now and then.
+            # Weighted by the time since the last sample: a run gives one row per cycle, a look one now and then.
             span = np.minimum(np.maximum(now - self._current_time, self._drives.description.cycle), CURRENT_MEMORY)
             share = np.where(where, span / CURRENT_MEMORY, 0.0)
             mean = rows[CURRENT].mean(axis=0) if len(rows[CURRENT]) > 1 else rows[CURRENT][0]
@@ -239,10 +241,10 @@ class Axes:
         return has_new_zero
 
     def _find_jumps(self, before: Integers, rows: Integers, now: float, where: Mask) -> bool:
-        """Return whether homing has set a new zero: the rotor has not moved, and its limits neither.
+        """Return whether homing has set a new zero: positions jump although the rotor, and so its limits, did not move.
 
-        Only an axis in operation enabled homes, and what its speed explains is a movement: an axis that another cause
-        accelerates in homing mode must not be taken for one whose zero moves with it.
+        Only an axis in operation enabled homes, and a step that its speed explains is a movement: an axis that
+        something else accelerates in homing mode has not got a new zero.
         """
         elapsed = np.minimum(np.maximum((now - self._position_time) / len(rows), self._drives.description.cycle), 1.0)
         last = wrapped(rows[-1] - (rows[-2] if len(rows) > 1 else before))

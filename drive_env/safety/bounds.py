@@ -1,4 +1,4 @@
-"""The limits of every axis as integers of its drive, at the scale and zero that it has now."""
+"""The limits of every axis as integers of its drive, at its present scale and zero."""
 
 from __future__ import annotations
 
@@ -38,13 +38,13 @@ ACCELERATION, DECELERATION, QUICK_STOP_DECELERATION = (
     (cia402.QUICK_STOP_DECELERATION, 0),
 )
 COUNTED = "pps"  # speeds in increments per second
-BY_RATIO = ("velocity unit", "velocity unit/s")  # of which two objects say how many rpm they are
-TARGET_UNIT = "set-point unit"  # of which two more say how many of those it is
+BY_RATIO = ("velocity unit", "velocity unit/s")  # two objects give their ratio to rpm
+TARGET_UNIT = "set-point unit"  # two more objects give its ratio to velocity units
 VL_SPEEDS = (*range(cia402.VL_TARGET_VELOCITY, cia402.VL_QUICK_STOP + 1), cia402.VL_REFERENCE)  # of the standard
-BY_MINUTE = ("rpm", "rpm/s")  # which the scale of positions turns into increments; other units are not set off
-# A settled axis swings by some counts around its target [inc], though by no more than so much of a turn [rev].
+BY_MINUTE = ("rpm", "rpm/s")  # converted by the scale of positions; any other unit is not checked
+# A settled axis swings around its target by at most SETTLED [inc], and at most SETTLED_TURNS [rev].
 SETTLED, SETTLED_TURNS = 200.0, 0.02
-SLACK_TURNS = 0.02  # besides, of a move that is meant to end at a limit: noise and overshoot may take it past [rev]
+SLACK_TURNS = 0.02  # rev, added for a move that ends at a limit: noise and overshoot may take it past
 
 
 @dataclass
@@ -52,24 +52,24 @@ class Bounds:
     """Limits of every axis, shape (num_axes,) each.
 
     Attributes:
-        low: Lowest position [inc]; -NO_LIMIT for none.
+        low: Lowest position [inc]; -NO_LIMIT without a limit.
         high: Highest position [inc].
-        given: Whether the user gave the position limits, which then hold in homing, too.
-        settled: How far a settled axis swings around its place [inc].
-        slack: How far beyond them is no leaving [inc].
+        given: Whether the user gave the position limits; those hold in homing, too.
+        settled: How far a settled axis swings around its target [inc].
+        slack: How far beyond its limits an axis may go without being stopped [inc].
         velocity: Highest speed [unit of 606Ch].
-        count: Increments a second of a count of 606Ch; nan where its unit tells none.
+        count: Increments a second of a count of 606Ch; nan if its unit cannot be converted.
         current: Highest current [unit of 6077h].
         following: Largest following error [inc].
-        braking: Deceleration of a quick stop [inc/s^2]; 0 where it is not known.
+        braking: Deceleration of a quick stop [inc/s^2]; 0 if unknown.
         profile: Highest deceleration of a profile [inc/s^2], or `braking`.
-        slowing: Deceleration of a profile that ends, or has no set-point any more [inc/s^2]; 0 where it is not known.
+        slowing: Deceleration of a profile that ends or has lost its set-point [inc/s^2]; 0 if unknown.
         rest: Speed below which an axis is at rest [inc/s].
-        default_speed: Whether the speed limit is ours, for want of another.
-        speed: Highest speed by positions [inc/s], where 606Ch does not count increments; else infinite.
-        lag: Of the position loop: what the demand is ahead of an axis, over its speed [s]; 0 where it is not known.
-        windup: How far an axis goes on by what the integral of its velocity loop holds, of a count of 6077h [inc]; 0
-            where it is not known.
+        default_speed: Whether the speed limit is this library's default, since neither user nor drive has one.
+        speed: Highest speed computed from positions [inc/s], if 606Ch does not count increments; else infinite.
+        lag: Distance of the position demand ahead of an axis, divided by its speed [s]; 0 if unknown.
+        windup: How far an axis goes on per count of 6077h that the integral of its velocity loop holds [inc]; 0 if
+            unknown.
     """
 
     low: Integers
@@ -97,13 +97,13 @@ class Bounds:
 
 @dataclass(frozen=True)
 class RotorLimits:
-    """The user's limits in revolutions of the rotor, which no scale moves, shape (num_axes,) each; nan without a limit.
+    """The user's limits in revolutions of the rotor (independent of the scale), shape (num_axes,); nan without a limit.
 
     Attributes:
-        low: Lowest place [rev].
-        high: Highest place [rev].
-        velocity: Highest speed [rev/s]; nan, too, where a count of 606Ch is not known.
-        following: Largest following error [rev]; nan, too, where the scale is not known.
+        low: Lowest position [rev].
+        high: Highest position [rev].
+        velocity: Highest speed [rev/s]; nan, too, if the unit of 606Ch is unknown.
+        following: Largest following error [rev]; nan, too, if the scale is unknown.
     """
 
     low: Floats
@@ -113,13 +113,13 @@ class RotorLimits:
 
 
 def rotor_limits(limits: Limits, drives: WatchedDrives, rotor: RotorAngle, here: Integers) -> RotorLimits:
-    """Return the user's limits as rotor angles and speeds of now.
+    """Return the user's limits as rotor angles and speeds, at the present scale and zero.
 
     Args:
-        limits: The user's.
+        limits: The user's limits.
         drives: The drives.
-        rotor: Where their rotors are.
-        here: What 6064h shows [inc].
+        rotor: Their rotor angles.
+        here: The present values of 6064h [inc].
     """
     count = drives.num_axes
     low, high = (None, None) if limits.position is None else limits.position
@@ -134,23 +134,23 @@ def rotor_limits(limits: Limits, drives: WatchedDrives, rotor: RotorAngle, here:
 
 
 def velocity_object(description: Description) -> Key:
-    """Return the object that shows the speed: 606Ch, or 6044h of a drive of vl alone, whose unit is known anyway."""
+    """Return the object that shows the speed: 606Ch, or 6044h of a drive with vl alone, whose unit is always known."""
     has = description.has
     return VL_VELOCITY if has(VL_VELOCITY) and not (has(POSITION) and has(VELOCITY)) else VELOCITY
 
 
 def unit_of(description: Description, key: Key) -> str:
-    """Return the unit of a speed or an acceleration; "" where the drive has no such object."""
+    """Return the unit of a speed or an acceleration; "" if the drive has no such object."""
     if key[0] in VL_SPEEDS:
         return TARGET_UNIT if key == VL_TARGET else BY_RATIO[0]
     return description.dictionary.find(key).unit if description.has(key) else ""
 
 
 def speed_in(key: Key, speed: Integers, bounds: Bounds, drives: WatchedDrives, rotor: RotorAngle) -> Integers:
-    """Return a limit of speed [counts of the object that shows it] in counts of another object.
+    """Convert a speed limit from counts of the object that shows the speed to counts of another object.
 
-    As it is where both have one unit. Where their ratio is not known, what positions may show at most counts, and what
-    the drive shows is held against the limit all the same.
+    Unchanged if both have the same unit. If their ratio is unknown, the limit of the speed from positions applies; the
+    speed that the drive shows is checked against the limit in any case.
     """
     shown, own = velocity_object(drives.description), unit_of(drives.description, key)
     if (shown != VL_VELOCITY and key[0] not in VL_SPEEDS) or own == unit_of(drives.description, shown):
@@ -170,19 +170,19 @@ def _speed_unit(drives: WatchedDrives) -> str:
 def read_bounds(
     limits: Limits, drives: WatchedDrives, rotor: RotorAngle, of_rotors: RotorLimits, in_vl: Mask | None = None
 ) -> Bounds:
-    """Return the limits of every axis; those that the user left open are read from the drives.
+    """Return the limits of every axis; limits that the user left open are read from the drives.
 
     Args:
-        limits: The user's.
+        limits: The user's limits.
         drives: The drives.
-        rotor: Where their rotors are.
-        of_rotors: The user's, as the rotors'.
-        in_vl: Axes in vl, of drives that have a ramp of its own for quick stops in it.
+        rotor: Their rotor angles.
+        of_rotors: The user's limits in revolutions.
+        in_vl: Axes in vl, if the drive has a separate ramp for quick stops in that mode.
     """
     low, high = _own_range(drives)
     ends = (of_rotors.low, of_rotors.high)
     is_given = ~(np.isnan(ends[0]) & np.isnan(ends[1]))
-    # Only the user's: a drive's own range is widened by who homes it, and the user's place is not.
+    # A limit is "given" only by the user: homing widens the drive's own range, but not the user's.
     bottom, top = (np.nan_to_num(rotor.increments(end), nan=0.0, posinf=2.0**61, neginf=-(2.0**61)) for end in ends)
     low = np.where(np.isnan(ends[0]), np.where(is_given, -NO_LIMIT, low), np.floor(bottom)).astype(np.int64)
     high = np.where(np.isnan(ends[1]), np.where(is_given, NO_LIMIT, high), np.ceil(top)).astype(np.int64)
@@ -199,7 +199,7 @@ def read_bounds(
     default = np.rint(DEFAULT_SPEED * rotor.scale / np.where(told, count, 1.0))
     velocity = np.where(ours, default, velocity).astype(np.int64)
     braking = _braking(drives, rotor, in_vl)
-    # The scale of a revolution may be mistaken: a speed in rpm is checked by positions, too.
+    # The scale may be wrong: a speed in rpm is checked by positions, too.
     by_position = np.where(told & (velocity < NO_LIMIT), velocity * np.nan_to_num(count), 0.0)
     settled = np.where(known_scale, np.minimum(SETTLED, SETTLED_TURNS * rotor.scale), SETTLED)
     return Bounds(
@@ -227,21 +227,21 @@ def read_bounds(
 
 
 def motion_gains(device: Device | None) -> dict[tuple[str, str], Key]:
-    """Return the gains of velocity and position loop by loop and part, of a device whose cascade we know."""
+    """Map loop and part to the gain objects of velocity and position loop; empty if the device's cascade is unknown."""
     if device is None or device.gains.cascade != PI:
         return {}
     return {(row.loop, row.part): row.key for row in device.gains.rows if row.loop in ("velocity", "position")}
 
 
 def _loops(drives: WatchedDrives, rotor: RotorAngle) -> tuple[Floats, Floats]:
-    """Return by how much a demand is ahead, of the speed [s], and the way that a count of current holds [inc]."""
+    """Return the lag of the position loop [s], and the distance per count of 6077h held in the integral [inc]."""
     device, none = drives.device, np.zeros(drives.num_axes)
     keys = motion_gains(device)
     if device is None or not keys:
         return none, none
     scales = dict(zip(device.gains.keys, loop_scales(device), strict=True))
     gain = {part: scales[key].value(read_own(drives, key, 0)) for part, key in keys.items()}
-    # The integral, in A, is P I f times the angle by which the axis is behind.
+    # The integral [A] is P I f times the angle by which the axis lags.
     per_rad = gain.get(("velocity", "P"), none) * gain.get(("velocity", "I"), none) * device.velocity_rate
     return (
         _reciprocal(gain.get(("position", "P"), none)),
@@ -254,7 +254,7 @@ def _reciprocal(value: Floats) -> Floats:
 
 
 def _ampere(drives: WatchedDrives) -> Floats:
-    """Return how many amperes a count of 6077h is; 0 where its unit tells none."""
+    """Return the amperes of a count of 6077h; 0 if its unit is unknown."""
     known, device = drives.description, drives.device
     if device is None or CURRENT not in device.bindings or not known.has(CURRENT):
         return np.zeros(drives.num_axes)
@@ -267,20 +267,20 @@ def _ampere(drives: WatchedDrives) -> Floats:
 
 
 def current_limits(drives: WatchedDrives) -> tuple[Key, ...]:
-    """Return the objects that limit a drive's current: none, one, or one for each sign."""
+    """Return the objects that limit a drive's current: zero, one, or two (one for each sign)."""
     role = drives.description.role
     found = (role(Role.CURRENT_LIMIT), role(Role.CURRENT_LIMIT_NEGATIVE))
     return tuple(key for key in found if key is not None)
 
 
 def current_scales(drives: WatchedDrives) -> tuple[Key, ...]:
-    """Return the objects that say what a count of a current is: none, or the motor's peak and nominal current."""
+    """Return the objects that scale a drive's current: the motor's peak and nominal current, or empty."""
     found = (drives.description.role(role) for role in (Role.PEAK_CURRENT, Role.NOMINAL_CURRENT))
     return tuple(key for key in found if key is not None)
 
 
 def counts_per_limit(drives: WatchedDrives) -> Floats:
-    """Return how many counts of 6077h one of the current limit is: 1, unless it counts parts of the nominal current."""
+    """Return the counts of 6077h per count of the current limit: 1 unless it is relative to the nominal current."""
     key, ampere = drives.description.role(Role.NOMINAL_CURRENT), _ampere(drives)
     if key is None:
         return np.ones(drives.num_axes)
@@ -288,19 +288,19 @@ def counts_per_limit(drives: WatchedDrives) -> Floats:
 
 
 def _current(drives: WatchedDrives, user: Floats) -> Integers:
-    """Return the greatest current [counts of 6077h]: the user's, or the drive's, of two signs the lower one."""
+    """Return the highest current [counts of 6077h]: the user's, or the drive's (the lower one of its two signs)."""
     counts, keys = counts_per_limit(drives), current_limits(drives)
     found = [_magnitude(drives, user, key, counts) for key in keys] or [_magnitude(drives, user, None)]
     return np.asarray(np.min(found, axis=0), np.int64)
 
 
-REST_TURNS, REST_INCREMENTS = 0.15, 2000.0  # rev/s, inc/s: what a velocity filter may show of a rotor at rest
+REST_TURNS, REST_INCREMENTS = 0.15, 2000.0  # rev/s, inc/s: a velocity filter may show this of a rotor at rest
 
 
 def _own_range(drives: WatchedDrives) -> tuple[Integers, Integers]:
-    """Return 607Dh, corrected by the home offset (CiA 402); an empty range is no limit."""
+    """Return 607Dh corrected by the home offset (CiA 402); without a limit if the range is empty."""
     low, high = read_own(drives, POSITION_LOW, -NO_LIMIT), read_own(drives, POSITION_HIGH, NO_LIMIT)
-    # The ends of the type, which are the factory's, are no limits; neither is an empty range.
+    # The ends of the type are the factory's default, not limits.
     empty = low >= high
     offset = read_own(drives, HOME_OFFSET, 0)
     return (
@@ -310,7 +310,7 @@ def _own_range(drives: WatchedDrives) -> tuple[Integers, Integers]:
 
 
 def read_own(drives: WatchedDrives, key: Key, absent: int) -> Integers:
-    """Return an object of every axis, or what stands for it where the drive does not have it, whatever its EDS says."""
+    """Return an object of every axis; `absent` if the drive lacks or refuses it, even if its EDS lists it."""
     if drives.description.has(key):
         with contextlib.suppress(RefusedError):
             found: Integers = drives.read_entry(drives.description.dictionary.find(key))
@@ -319,14 +319,14 @@ def read_own(drives: WatchedDrives, key: Key, absent: int) -> Integers:
 
 
 def _at_scale(user: Floats, now: Floats) -> Floats:
-    """Return the user's limit in whole counts of today's scale; as it was given where the scale is not known."""
+    """Return the user's limit in whole counts of the present scale; unconverted if the scale is unknown."""
     return np.where(np.isfinite(now), np.maximum(np.floor(now + 1e-6), 1.0), user)
 
 
 def _magnitude(drives: WatchedDrives, user: Floats, key: Key | None, counts: Floats | float = 1.0) -> Integers:
-    """Return the user's limit, or the drive's if it has one; 0 and the end of the type switch the drive's off.
+    """Return the user's limit, otherwise the drive's; NO_LIMIT if that is 0 or the end of its type.
 
-    One of the drive's is `counts` of the user's.
+    One count of the drive's limit is `counts` counts of the user's.
     """
     if np.isnan(user).any() and key is not None:
         found = read_own(drives, key, NO_LIMIT)
@@ -339,11 +339,11 @@ def _magnitude(drives: WatchedDrives, user: Floats, key: Key | None, counts: Flo
 
 
 def increments_per_count(unit: str, rotor: RotorAngle) -> Floats:
-    """Return the increments a second (or second squared) of a count of a speed (or an acceleration), nan if unknown.
+    """Return the increments per second (or second squared) of a count of a speed (or an acceleration); nan if unknown.
 
     Args:
-        unit: As the EDS names it.
-        rotor: Its scale: increments of a revolution, 1 and less where they are not known.
+        unit: The unit's name in the EDS.
+        rotor: Gives the increments per revolution; 1 and less if unknown.
     """
     number, base = split_unit(unit)
     scale = rotor.scale
@@ -356,13 +356,13 @@ def increments_per_count(unit: str, rotor: RotorAngle) -> Floats:
 
 
 def _slowing(drives: WatchedDrives, rotor: RotorAngle) -> Floats:
-    """Return 6084h, where that is 0 6083h [inc/s^2]."""
+    """Return 6084h [inc/s^2], or 6083h if 6084h is 0."""
     down = _rate(drives, DECELERATION, rotor)
     return np.where(down > 0.0, down, _rate(drives, ACCELERATION, rotor))
 
 
 def _rate(drives: WatchedDrives, key: Key, rotor: RotorAngle) -> Floats:
-    """Return a deceleration [inc/s^2]; 0 where the drive has none, or counts it in units that we do not know."""
+    """Return a deceleration [inc/s^2]; 0 if the drive has none or its unit is unknown."""
     known = drives.description
     if not known.has(key):
         return np.zeros(drives.num_axes)
@@ -375,13 +375,13 @@ def _rate(drives: WatchedDrives, key: Key, rotor: RotorAngle) -> Floats:
 def read_vl_rate(
     drives: WatchedDrives, keys: tuple[Key, Key], rotor: RotorAngle, written: Mapping[Key, Integers] | None = None
 ) -> Floats:
-    """Return the deceleration of a ramp of vl [inc/s^2]; 0 where drive or scale have none, infinite without a time.
+    """Return the deceleration of a ramp of vl [inc/s^2]; 0 if ramp or scale is missing, infinite if its time is 0.
 
     Args:
         drives: The drives.
-        keys: The ramp, a speed and a time in s; where it has no speed, that of 604Eh counts.
-        rotor: Their scale.
-        written: Values that some of these objects will have, (num_axes,) each.
+        keys: The ramp's objects: a speed and a time in s; if its speed is 0, that of 604Eh counts.
+        rotor: Gives their scale.
+        written: Values about to be written to some of these objects, (num_axes,) each.
     """
     count = np.nan_to_num(increments_per_count(BY_RATIO[0], rotor))
     found, written = np.zeros(drives.num_axes), written or {}
@@ -395,7 +395,7 @@ def read_vl_rate(
 
 
 def _braking(drives: WatchedDrives, rotor: RotorAngle, in_vl: Mask | None) -> Floats:
-    """Return the deceleration of a quick stop [inc/s^2]: 6085h, in vl 604Ah or 6051h where set; 0: not known."""
+    """Return the deceleration of a quick stop [inc/s^2]: 6085h, or 604Ah or 6051h in vl if set; 0 if unknown."""
     ramp = _rate(drives, QUICK_STOP_DECELERATION, rotor)
     if in_vl is None:
         return ramp

@@ -67,7 +67,7 @@ if TYPE_CHECKING:
     from drive_env.safety.watched_drives import WatchedDrives
 
 
-# Objects whose magnitude is a command, and which limit holds it.
+# Objects whose magnitude is a command, and the limit that applies to it.
 _MAGNITUDES = {
     TARGET_VELOCITY: "velocity",
     VL_TARGET: "velocity",
@@ -78,7 +78,7 @@ _MAGNITUDES = {
     TARGET_TORQUE: "current",
     TORQUE_OFFSET: "current",
 }
-# Set-points that add up.
+# Set-points that are added.
 _PARTNERS = {
     TARGET_VELOCITY: VELOCITY_OFFSET,
     VELOCITY_OFFSET: TARGET_VELOCITY,
@@ -88,12 +88,12 @@ _PARTNERS = {
 
 
 class Commands:
-    """The set-points of some drives, and the checks whether the next command would lead beyond a limit.
+    """The set-points of some drives, and the checks of each command against the limits.
 
     Args:
         drives: The drives.
-        axes: What is known of them.
-        limits: Those that hold.
+        axes: Their present state.
+        limits: The limits in force.
         modes: Returns the mode of operation of every axis.
     """
 
@@ -108,10 +108,10 @@ class Commands:
         self._limits = limits
         self._modes = modes
         role = drives.description.role
-        # Objects that enable otherwise than a controlword, and the bits by which they do: mask and value.
+        # Objects other than the controlword that enable: mask and value of the bits that do it.
         self._enables = {role(Role.SERVICE_COMMAND): (3, 1), role(Role.NATIVE_CONTROL): (2, 2)}
         self._target_inside = drives.description.role(Role.TARGET_INSIDE)
-        self._set_points: dict[Key, Integers] = {}  # as they were written or read last
+        self._set_points: dict[Key, Integers] = {}  # as written or read last
 
     def check_write(self, entry: Entry, raw: Integers, where: Mask) -> None:
         """Raise SafetyError for a value that would pass a limit, or redefine positions at the wrong time."""
@@ -119,7 +119,7 @@ class Commands:
         self._check_meaning(entry, where)
 
     def check_play(self, played: Mapping[Entry, Integers], words: Integers | None) -> None:
-        """Raise SafetyError for rows that would pass a limit; `words` are those of the controlword among them."""
+        """Raise SafetyError for rows that would pass a limit; `words` are the controlwords among them."""
         has_target = self._drives.description.has(TARGET_POSITION)
         relative = has_target and words is not None and bool(np.any(words & cia402.RELATIVE))
         for entry, rows in played.items():
@@ -141,17 +141,17 @@ class Commands:
             self._check_played_moves(words, played)
 
     def _is_other_target(self, key: Key) -> bool:
-        """Return whether an object is the target position by another name than 607Ah."""
+        """Return whether an object is a target position other than 607Ah."""
         return key in (INTERPOLATED_POSITION, self._target_inside)
 
     def _target(self, key: Key, raw: Integers) -> Integers:
-        """Return targets by another object than 607Ah in increments of 6064h, as it counts now."""
+        """Convert targets of another object than 607Ah to increments of 6064h, as counted now."""
         if key == INTERPOLATED_POSITION:
             return raw
         actual = self._drives.description.role(Role.POSITION_INSIDE)
         assert actual is not None, "a drive with a target inside has it"
         scale = self._axes.rotor.scale / TURN_INSIDE
-        # 6064h is the lower end of the position inside, whose turns of 32 bits it does not tell.
+        # 6064h is the lower 32 bits of the drive's internal position; the turns above are not readable.
         above = read_own(self._drives, actual, 0) * scale - read_own(self._drives, POSITION, 0)
         return np.rint(raw * scale - 2.0**32 * np.rint(above / 2.0**32)).astype(np.int64)
 
@@ -170,7 +170,7 @@ class Commands:
             self.note_running(where, (key,))
 
     def note_running(self, where: Mask, keys: tuple[Key, ...] = (TARGET_VELOCITY, TARGET_TORQUE)) -> None:
-        """Note that axes act on the set-points of speed and torque that they have, by default on both."""
+        """Note that axes act on their stored set-points of speed and torque, by default on both."""
         for key in keys:
             asked = self._set_points.get(key, 0) + self._set_points.get(_PARTNERS[key], 0)
             if _MAGNITUDES[key] == "velocity":
@@ -179,7 +179,7 @@ class Commands:
                 self._axes.asked_current = np.where(where, asked, self._axes.asked_current)
 
     def _speed_count(self) -> Floats:
-        """Return the increments a second of a count of 60FFh; 0 where its unit tells none."""
+        """Return the increments per second of a count of 60FFh; 0 if its unit is unknown."""
         return np.nan_to_num(increments_per_count(unit_of(self._drives.description, TARGET_VELOCITY), self._axes.rotor))
 
     def forget(self, key: Key | None = None) -> None:
@@ -190,7 +190,7 @@ class Commands:
             self._set_points.pop(key, None)
 
     def note_start(self, words: Integers, where: Mask) -> None:
-        """Note where moves in pp lead that a controlword has started."""
+        """Note the target of each move in pp that a controlword has started."""
         starts = where & cia402.may_enable(words) & (words & cia402.NEW_SET_POINT != 0) & (self._axes.mode == PP)
         target = self._set_points.get(TARGET_POSITION)
         for axis in np.flatnonzero(starts).tolist() if target is not None else ():
@@ -220,13 +220,13 @@ class Commands:
                 self._check_position(target, base + distance, starts & relative, (PP,))
 
     def check_played_starts(self, words: Integers, played: Mapping[Entry, Integers]) -> None:
-        """Raise SafetyError for moves that rows start at a speed, which the drive has already, beyond the limit."""
+        """Raise SafetyError for moves that rows start at a speed, already set in the drive, beyond the limit."""
         starts = (cia402.may_enable(words) & (words & cia402.NEW_SET_POINT != 0)).any(axis=0)
         if starts.any():
             self._check_speeds(starts, self._modes(), MOVING_SPEEDS, self._limits.bounds().velocity, played)
 
     def _bases(self) -> list[Integers]:
-        """Return from where relative moves may go on: the target before, the demand or the actual position (60F2h)."""
+        """Return the possible bases of relative moves (60F2h): the previous target, the demand, the actual position."""
         options = read_own(self._drives, POSITIONING_OPTIONS, 0) & 3
         demand = read_own(self._drives, DEMAND, 0)
         aims = np.array(
@@ -237,7 +237,7 @@ class Commands:
         return [demand, aims, read_own(self._drives, POSITION, 0)]
 
     def _check_played_moves(self, words: Integers, played: Mapping[Entry, Integers]) -> None:
-        """Check moves that rows start, each relative to the ones before."""
+        """Check moves that rows start, each relative to the previous one."""
         bounds = self._limits.bounds()
         if not bounds.has_position:
             return
@@ -258,7 +258,7 @@ class Commands:
         """Check the sum of target and offset in csp; in pp the target alone."""
         by_key = {(other.index, other.sub): values for other, values in played.items()}
         if (entry.index, entry.sub) == POSITION_OFFSET and TARGET_POSITION in by_key:
-            return  # with the target
+            return  # checked with the target
         target = by_key.get(TARGET_POSITION, self._last(TARGET_POSITION))
         offset = by_key.get(POSITION_OFFSET, self._last(POSITION_OFFSET))
         aim = target + offset
@@ -332,7 +332,7 @@ class Commands:
         outside = (aim < bounds.low) | (aim > bounds.high)
         if not outside.any():
             return
-        # The mode is an SDO transfer away, half a millisecond of a policy's cycle: asked for only where it matters.
+        # Reading the mode costs an SDO transfer (half a millisecond of a policy's cycle): only where it matters.
         rows, outside = np.atleast_2d(aim), np.atleast_2d(outside)
         if (wrong := np.flatnonzero(axes & outside.any(axis=0) & np.isin(self._modes(), modes))).size:
             axis = int(wrong[0])
@@ -345,9 +345,9 @@ class Commands:
             )
 
     def _check_jumps(self, entry: Entry, aim: Integers, axes: Mask) -> None:
-        """Raise SafetyError for set-points of csp that jump faster than an axis may turn, where nothing softens that.
+        """Raise SafetyError for set-points of csp that jump faster than a stepper may turn.
 
-        A stepper's field is where its set-point is: after a jump the motor has lost steps, and stands anywhere.
+        A stepper's field follows the set-point: after a jump the motor has lost steps, and its position is unknown.
         """
         if not self._is_stepped or not np.any(axes & self._axes.live):
             return
@@ -369,16 +369,16 @@ class Commands:
             )
 
     def _interpolation_period(self) -> Floats:
-        """Return the time that a set-point of csp takes [s]; 0 where the drive does not say."""
+        """Return the time of interpolation between set-points of csp [s]; 0 if the drive does not report it."""
         value, index = (read_own(self._drives, (cia402.INTERPOLATION_PERIOD, sub), 0) for sub in (1, 2))
         return np.asarray(value * 10.0 ** index.astype(float), float)
 
     def _check_mode_room(self, modes: Integers, axes: Mask) -> None:
-        """Raise SafetyError for a mode of a position in which an axis would not come to rest within its travel.
+        """Raise SafetyError for a position mode in which an axis would not come to rest within its travel.
 
-        The demand of such a mode is ahead of the axis, and pp without a set-point brakes by its profile's ramp. Homing
-        is checked against nothing before it moves, so it begins from rest: an axis on its way to a distant set-point
-        would be stopped, for its speed, by a ramp that is longer than that way.
+        In such a mode the demand is ahead of the axis, and pp without a set-point brakes by its profile's ramp. Homing
+        begins from rest, since its moves cannot be checked in advance: an axis on its way to a distant set-point would
+        be stopped for its speed, by a ramp longer than that way.
         """
         bounds, speed = self._limits.bounds(), self._axes.newest_speed()
         if not (bounds.has_position and axes.any()):
@@ -403,7 +403,7 @@ class Commands:
             )
 
     def _check_braking_room(self, entry: Entry, value: Integers, where: Mask) -> None:
-        """Raise SafetyError for a speed of csv from which a quick stop would end outside: its ramp begins with that."""
+        """Raise SafetyError for a set-point of csv from whose speed a quick stop would end outside the travel."""
         bounds, axes = self._limits.bounds(), self._axes
         if not bounds.has_position:
             return
@@ -442,7 +442,7 @@ class Commands:
         above = np.maximum(np.abs(raw), np.abs(value)) > limit
         if not above.any():
             return
-        shown = np.where(np.abs(raw) > np.abs(value), raw, value)  # it alone may be too much, the sum less
+        shown = np.where(np.abs(raw) > np.abs(value), raw, value)  # one alone may exceed the limit, the sum not
         rows, above = np.atleast_2d(np.broadcast_to(shown, above.shape)), np.atleast_2d(above)
         wrong = np.flatnonzero(where & above.any(axis=0))
         if wrong.size:
@@ -455,16 +455,16 @@ class Commands:
             )
 
     def _speed_in(self, key: Key, limit: NDArray[Any]) -> NDArray[Any]:
-        """Return a limit of speed [counts of what shows the speed] in counts of an object."""
+        """Convert a speed limit [counts of the object that shows the speed] to counts of another object."""
         return speed_in(key, limit, self._limits.bounds(), self._drives, self._axes.rotor)
 
     def _own_current_limit(self) -> Integers:
-        """Return how high the drive's own current limit may be set: to the user's, or to anything."""
+        """Return the highest value allowed for the drive's own current limit: the user's limit, or unlimited."""
         user = given(self._limits.user.current, self._drives.num_axes)
         return np.where(np.isnan(user) | np.isinf(user), NO_LIMIT, np.nan_to_num(user, posinf=0.0)).astype(np.int64)
 
     def _check_braking(self, entry: Entry, raw: Integers, where: Mask) -> None:
-        """Raise SafetyError for a ramp that would let an axis that is turning run on."""
+        """Raise SafetyError for a ramp that is too slow to stop an axis that is turning."""
         count = increments_per_count(entry.unit, self._axes.rotor)
         where = where & ~np.isnan(count)
         if not where.any():
@@ -475,12 +475,12 @@ class Commands:
         axes = where & self._axes.may_turn
         if np.any(slow := axes & (ramp < self._unramped_ramp())):
             self._refuse_mode(slow & np.isin(self._modes(), UNRAMPED_MODES), ramp)
-        in_vl = np.any(read_vl_rate(self._drives, VL_QUICK_STOP, self._axes.rotor) > 0.0)  # which has its own ramp
+        in_vl = np.any(read_vl_rate(self._drives, VL_QUICK_STOP, self._axes.rotor) > 0.0)  # vl has its own ramp
         modes = np.where(in_vl & (self._modes() == VL), 0, self._modes())
         self._check_speeds(axes, modes, {**RUNNING_SPEEDS, **MOVING_SPEEDS}, raw * STOP_WITHIN)
 
     def _check_vl_braking(self, entry: Entry, raw: Integers, where: Mask) -> None:
-        """Raise SafetyError for a ramp of a quick stop in vl that would let an axis that is turning run on."""
+        """Raise SafetyError for a quick-stop ramp in vl that is too slow to stop an axis that is turning."""
         key = entry.index, entry.sub
         raw = np.atleast_2d(raw)
         raw = raw.min(axis=0) if key in (VL_QUICK_STOP[0], VL_REFERENCE) else raw.max(axis=0)
@@ -492,7 +492,7 @@ class Commands:
         self._check_speeds(where & self._axes.may_turn, self._modes(), {VL: RUNNING_SPEEDS[VL]}, limit)
 
     def _check_stops_turning(self, entry: Entry, raw: Integers, ramp: Floats, where: Mask) -> None:
-        """Raise SafetyError for a ramp [inc/s^2] that does not stop an axis soon enough from the speed that it has."""
+        """Raise SafetyError for a ramp [inc/s^2] that does not stop a turning axis within STOP_WITHIN."""
         wrong = np.flatnonzero(where & self._axes.live & (ramp * STOP_WITHIN < np.abs(self._axes.velocity)))
         if wrong.size:
             axis = int(wrong[0])
@@ -506,14 +506,13 @@ class Commands:
     ) -> None:
         """Raise SafetyError for axes that would be too fast in their mode as soon as they are enabled.
 
-        The speed that a drive has from before is held against the limit. What torques or set-points of csp make of an
-        axis has no speed that could be: until it is seen, it is as fast as its inertia lets it become, and only a quick
-        stop's ramp of that order brings it to rest.
+        The speeds stored in the drive are checked against the limit. Torques and set-points of csp have no such speed:
+        only a quick stop's ramp of sufficient size brings the axis to rest, so that ramp is checked instead.
 
         Args:
-            axes: Those that may be enabled.
-            modes: What they will be in, by default the modes that they have.
-            played: Rows that are played at once, and are checked by themselves.
+            axes: Axes that may be enabled.
+            modes: The modes that they will have; their present modes by default.
+            played: Rows played with them, which are checked separately.
         """
         if not axes.any():
             return
@@ -528,9 +527,10 @@ class Commands:
             self._check_speeds(axes, row, RUNNING_SPEEDS, bounds.velocity, played)
 
     def check_turning(self, axes: Mask) -> None:
-        """Raise SafetyError for axes that turn while switched off, faster than they may once they are enabled.
+        """Raise SafetyError for axes that turn while switched off, faster than their limit once enabled.
 
-        What coasts or is pulled has a speed that no set-point tells, and a quick stop's ramp may be too slow for it.
+        An axis that coasts or is pulled has a speed that no set-point shows, and a quick stop's ramp may be too slow
+        for it.
         """
         if not axes.any():
             return
@@ -565,7 +565,7 @@ class Commands:
         limit: NDArray[Any],
         played: Mapping[Entry, Integers] | None = None,
     ) -> None:
-        """Raise SafetyError for axes whose drives have a speed for their mode that is beyond the limit."""
+        """Raise SafetyError for axes whose drive has, for their mode, a stored speed beyond the limit."""
         played_keys = {(entry.index, entry.sub) for entry in played or {}}
         for mode, sums in speeds.items():
             if not np.any(chosen := axes & (modes == mode)):
@@ -583,12 +583,12 @@ class Commands:
                     )
 
     def _unramped_ramp(self) -> Floats:
-        """Return the slowest ramp of a quick stop that modes without a limit of speed may have [inc/s^2]."""
+        """Return the slowest quick-stop ramp allowed in modes without a speed limit [inc/s^2]."""
         scale = self._axes.rotor.scale
         return np.where(scale > 1.0, DEFAULT_SPEED * scale / STOP_WITHIN, 0.0)
 
     def _ramp_count(self) -> Floats:
-        """Return the increments per second squared of a count of 6085h; nan where its unit tells none."""
+        """Return the increments per second squared of a count of 6085h; nan if its unit is unknown."""
         return increments_per_count(self._known.find(QUICK_STOP_DECELERATION).unit, self._axes.rotor)
 
     def _refuse_mode(self, wrong: Mask, ramp: Integers | Floats) -> None:

@@ -1,16 +1,15 @@
-"""The envelope around whatever acts on drives of a bus: limits, an oscillation detector, stops.
+"""The envelope around a program that moves drives on a bus: limits, an oscillation detector, stops.
 
-Four lines of defence, each for the failure of the one before:
-- what the program commands is refused before it is sent (`before_write`, `before_play`; `commands.py`);
-- what the drives do is watched, by the samples of every communication cycle and otherwise by a thread of its own
-  (`watch.py`, `judging.py`), and they are stopped by grades (`stop_runner.py`, `stopping.py`);
-- limits that are tighter than the drives' own are lent to them (`limits_in_force.py`, `lending.py`);
-- a process that dies is noticed by the drives themselves (`watchdogs.py`, `master/can/error_control.py`).
+Four lines of defence, each in case the previous one fails: - a command beyond a limit is refused before it is sent
+(`before_write`, `before_play`; `commands.py`); - the drives are watched, by the samples of every communication cycle
+and otherwise by a separate thread (`watch.py`, `judging.py`), and stopped by grades (`stop_runner.py`, `stopping.py`);
+- limits that are tighter than the drives' own are written to them for the time of motion (`limits_in_force.py`,
+`lending.py`); - the drives themselves notice that the process has died (`watchdogs.py`, `master/can/error_control.py`).
 
-Whether an axis is live is what its statusword says, and it counts as live from before a frame that could enable it is
-sent. A watchdog is given up only where the statusword, read back, shows every axis of its node off.
+An axis is live if its statusword says so, or from just before a frame is sent that could enable it. A watchdog is given
+up only if the statusword, read back, shows every axis of its node off.
 
-A program that touches no limit sees the same integers with the envelope and without.
+A program that stays within the limits reads the same integers with and without the envelope.
 """
 
 from __future__ import annotations
@@ -62,8 +61,8 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 
-DEVICE_OBJECTS = 0x2000  # below are those of communication
-# Limits of the drives themselves, and what tells their stopping distance.
+DEVICE_OBJECTS = 0x2000  # below are the communication objects
+# Objects that limit the drives or give their stopping distance.
 _BOUNDS = (
     POSITION_LOW, POSITION_HIGH, FOLLOWING_WINDOW, MAX_PROFILE_VELOCITY, QUICK_STOP_DECELERATION, ACCELERATION,
     DECELERATION, HOME_OFFSET, *VL_BRAKING,
@@ -71,10 +70,10 @@ _BOUNDS = (
 
 
 class Envelope:
-    """The limits at work on some drives.
+    """The limits in force on some drives.
 
     Args:
-        limits: What the program may do.
+        limits: The limits of the program.
         drives: The drives.
 
     Raises:
@@ -95,10 +94,10 @@ class Envelope:
             prepare=lambda: drives.prepare_watch(self), poll=lambda: drives.poll(self),
         )  # fmt: skip
         self._commands = Commands(drives, self._axes, self._limits, self._watch.modes)
-        self._checked_stop: Stop | None = None  # when the controlword that is being written was checked
+        self._checked_stop: Stop | None = None  # the stop under way when the controlword being written was checked
         self._is_closing = False
         self._disabling = np.zeros(drives.num_axes, bool)  # the last controlword was "disable operation"
-        self._played: dict[Key, Integers] = {}  # modes and set-points of the rows that are under way
+        self._played: dict[Key, Integers] = {}  # modes and set-points of the rows being played
         self._of_further_axes = drives.description.of_further_axes()
         self._set_points = frozenset((*SET_POINTS, drives.description.role(Role.TARGET_INSIDE)))
 
@@ -118,16 +117,16 @@ class Envelope:
 
     # --- what drives on a bus call --------------------------------------------------------------------------------
     def change(self, limits: Limits) -> None:
-        """Take other limits; those of position are places of the rotors as 6064h shows them now."""
+        """Replace the limits; those of position are in the present counts of 6064h."""
         limits.check_axes(self._drives.num_axes)
         self._limits.change(limits)
 
     def leave_alone(self, axes: Iterable[int]) -> None:
-        """Note axes that the program never moves: their drives are lent nothing."""
+        """Note axes that the program never moves: no limits are lent to their drives."""
         self._lending.left_alone = frozenset(axes)
 
     def enter(self) -> None:
-        """Begin a call of the program; raise once for a stop that the supervisor made meanwhile."""
+        """Begin a call of the program; raise once for a stop that the supervisor has made since the last call."""
         self.alive()
         if self._watch.booted:
             self._after_restart()
@@ -138,7 +137,7 @@ class Envelope:
         self._watch.alive()
 
     def before_write(self, entry: Entry, raw: Integers, where: Mask) -> None:
-        """Raise SafetyError for a value that would pass a limit; make ready for motion before it is commanded."""
+        """Raise SafetyError for a value that would pass a limit; arm the watch before the first command of motion."""
         key = (entry.index, entry.sub)
         self._check_place(entry)
         self._watch.await_stop()
@@ -151,7 +150,7 @@ class Envelope:
         if entry.index >= DEVICE_OBJECTS and not self._axes.is_armed and self._finds_live(where):
             self._arm()
         self._commands.check_write(entry, raw, where)
-        self._note_mode(key, where)  # after the checks: what is refused changes nothing
+        self._note_mode(key, where)  # after the checks: a refused write changes nothing
         if key in self._set_points:
             self._arm()
         if self._axes.is_armed:
@@ -167,7 +166,7 @@ class Envelope:
             self._limits.keep_place()
 
     def after_failed_write(self, entry: Entry) -> None:
-        """Note that a drive may or may not have taken a write."""
+        """Note that a drive may or may not have executed a write."""
         key = (entry.index, entry.sub)
         self._commands.forget(key)
         if key in scale_objects(self._drives.description):
@@ -193,12 +192,12 @@ class Envelope:
         elif self._is_limit(key):
             self._limits.forget()
             if key == HOME_OFFSET and self._axes.is_armed:
-                self._limits.lend()  # it corrects software limits
+                self._limits.lend()  # also corrects software limits
         elif entry.index == STORE and self._axes.is_armed:
             self._lend()
 
     def _is_limit(self, key: Key) -> bool:
-        """Return whether limits, or the way of a stop, depend on an object."""
+        """Return whether the limits or the stopping distance depend on an object."""
         gains = motion_gains(self._drives.device).values()
         of_current = current_limits(self._drives) + current_scales(self._drives)
         return key in _BOUNDS or key in of_current or key in gains
@@ -225,11 +224,11 @@ class Envelope:
         return True
 
     def own(self, entry: Entry, axis: int, found: int) -> int:
-        """Return the program's own value of an object that reads `found`: the one before where another is lent."""
+        """Return the program's own value of an object; `found`, the value read, if none is lent."""
         return self._lending.own((entry.index, entry.sub), axis, found)
 
     def before_play(self, played: Mapping[Entry, Integers]) -> None:
-        """Raise SafetyError for rows that would pass a limit; make ready for motion if they command any."""
+        """Raise SafetyError for rows that would pass a limit; arm the watch if they command motion."""
         self._watch.await_stop()
         if not played:
             return
@@ -257,7 +256,7 @@ class Envelope:
         }
 
     def _check_place(self, entry: Entry) -> None:
-        """Raise SafetyError for a further axis' object by its own index, by which nothing would monitor that axis."""
+        """Raise SafetyError for an object that addresses a further axis directly: that axis would not be monitored."""
         found = self._of_further_axes.get((entry.index, entry.sub))
         if found is not None:
             first, axis = found
@@ -267,7 +266,7 @@ class Envelope:
             )
 
     def _check_ends(self, words: Integers, played: Sequence[Key]) -> None:
-        """Stop axes that turn before rows take their voltage away, or ramp too slowly; refuse rows that let them turn.
+        """Stop axes that turn before rows cut their voltage or ramp too slowly; refuse rows that first let them turn.
 
         Raises:
             SafetyError: If an earlier row lets an axis turn that a later one cuts, or disables by a slow ramp.
@@ -289,7 +288,7 @@ class Envelope:
         self._brake_slow_ramps(np.asarray(disables.any(axis=0)))
 
     def _brake_slow_ramps(self, disables: Mask) -> None:
-        """Quick-stop axes that "disable operation" would let run on: its ramp obeys no quick stop once it runs."""
+        """Quick-stop axes that "disable operation" would let run on: that ramp, once begun, obeys no quick stop."""
         if not disables.any() or not self._watch.look_for_live():
             return
         slow = disables & self._axes.live & self._stops.slow_ramps()
@@ -301,7 +300,7 @@ class Envelope:
             self._brake(slow)
 
     def _check_no_ramp_runs(self, entry: Entry, where: Mask) -> None:
-        """Raise SafetyError for another deceleration while "disable operation" brings an axis to rest by it."""
+        """Raise SafetyError for a change of deceleration while "disable operation" brings an axis to rest by it."""
         disabling = where & self._disabling
         if disabling.any() and self._watch.look_for_live() and np.any(disabling & self._axes.live):
             raise SafetyError(
@@ -310,7 +309,7 @@ class Envelope:
             )
 
     def _check_cuts(self, after: Mask, cuts: Mask) -> None:
-        """Raise SafetyError for rows that take the voltage from an axis which an earlier row lets turn."""
+        """Raise SafetyError for rows that cut the voltage of an axis which an earlier row lets turn."""
         if (wrong := np.flatnonzero((after & cuts).any(axis=0))).size:
             raise SafetyError(
                 f"axis {int(wrong[0])}: these rows take the voltage away after they have enabled it, and it may turn "
@@ -325,7 +324,7 @@ class Envelope:
                 self.after_write(entry, rows[-1], self._axes.everywhere)
 
     def after_failed_play(self, played: Mapping[Entry, Integers]) -> None:
-        """Note that the drives may have taken any of the rows."""
+        """Note that the drives may have executed any of the rows."""
         self._played = {}
         for entry in played:
             self.after_failed_write(entry)
@@ -340,7 +339,7 @@ class Envelope:
         self._axes.take_for_off(axes)
 
     def after_reset(self, nodes: Sequence[int]) -> None:
-        """Note that nodes, by position, were reset: their error control is their own again."""
+        """Note that nodes, by position, were reset: their error control has its own values again."""
         for k in nodes:
             self._watchdogs.forget(k)
             self._watch.booted.discard(k)
@@ -348,7 +347,7 @@ class Envelope:
         self._commands.forget()
         self._axes.aim.clear()
         self._axes.epoch += 1
-        self._axes.is_armed = False  # the next command arms anew; what still runs is watched on
+        self._axes.is_armed = False  # the next command arms anew; nodes still running remain watched
         self._limits.forget()
         if self._axes.rotor.is_placed:
             self._limits.place()
@@ -359,7 +358,7 @@ class Envelope:
             self._watch.note_restart(node)
 
     def _after_restart(self) -> None:
-        """Forget the state of nodes that restarted, and have the program informed."""
+        """Forget the state of nodes that restarted, and report it to the program at its next call."""
         nodes = sorted(self._watch.booted)
         self._drives.forget(nodes)
         self.after_reset(nodes)  # a boot-up says nothing of the axes: reset communication leaves them running
@@ -384,20 +383,20 @@ class Envelope:
     def observe(
         self, rows: Mapping[Key, Integers], epoch: int, where: Mask | None = None, coming: int | None = None
     ) -> None:
-        """Look at samples, each object of shape (rows, num_axes); stop and raise SafetyError beyond a limit.
+        """Check samples, each object of shape (rows, num_axes); stop and raise SafetyError beyond a limit.
 
         Args:
             rows: The samples, one communication cycle apart.
-            epoch: The envelope's when they were asked for.
-            where: Axes that they are of, all by default.
-            coming: The number of the row that goes out next, of those that are played.
+            epoch: The envelope's epoch when they were requested.
+            where: The axes that they belong to; None: all.
+            coming: The number of the played row that is sent next.
         """
         if coming is not None:
             self._note_rows(coming)
         self._watch.observe(rows, epoch, where)
 
     def _note_rows(self, coming: int) -> None:
-        """Note the axes' mode from the newest played row, and the set-points from the row that comes."""
+        """Note the axes' mode from the newest played row, and the set-points from the row sent next."""
         for key, rows in self._played.items():
             if key != MODE:
                 self._commands.note(key, rows[min(coming, len(rows) - 1)], self._axes.everywhere)
@@ -425,7 +424,7 @@ class Envelope:
         """Have live axes quick-stopped at the supervisor's next turn, whatever the program's thread is doing.
 
         Any thread may call it; it returns at once. The program gets a SafetyError at its next call, or in the one that
-        is under way. An axis that a weight pulls is held, as after a limit was passed.
+        is under way. An axis pulled by a weight is held, as after any stop for a limit.
 
         Args:
             reason: What the error says.
@@ -433,7 +432,7 @@ class Envelope:
         self._watch.ask_to_stop(reason)
 
     def close(self) -> None:
-        """Stop live axes; give the drives their lent values and watchdogs back, once they are proved off."""
+        """Stop live axes; restore the drives' own values and watchdogs once the axes are proved off."""
         if self._is_ours():
             with self._uninterrupted():
                 self.stop("the drives are closed while enabled")
@@ -441,14 +440,14 @@ class Envelope:
         self._end_watching()
 
     def _is_ours(self) -> bool:
-        """Return whether this program has enabled or commanded anything, or made ready to."""
+        """Return whether this program has enabled, commanded or armed anything."""
         return self._axes.is_armed or self._watch.is_supervised or bool(self._axes.may_turn.any())
 
     # --- signals --------------------------------------------------------------------------------------------------
     def interrupt(self) -> bool:
-        """Begin to stop, since a signal ends the program; return whether that is under way already.
+        """Begin to stop, since a signal ends the program; return whether a stop for a signal is already under way.
 
-        Called from a signal handler, between any two instructions of the program: it only asks the supervisor.
+        Called from a signal handler, between any two instructions of the program: it only notifies the supervisor.
         """
         if self._is_closing or self._watch.is_told_to_end:
             return True
@@ -458,12 +457,12 @@ class Envelope:
         return False
 
     def carry_on(self) -> None:
-        """Have the program told that it was stopped, since it goes on."""
+        """Report the stop to the program after all, since it continues."""
         self._watch.carry_on()
 
     @contextlib.contextmanager
     def _uninterrupted(self) -> Iterator[None]:
-        """Let no signal that the library hears end a block."""
+        """Keep signals that the library handles from ending a block: a stop counts as under way meanwhile."""
         before, self._is_closing = self._is_closing, True
         try:
             yield
@@ -503,7 +502,7 @@ class Envelope:
             self._commands.note_running(enabled)
             with self._axes.lock:
                 if self._stops.current is not self._checked_stop:
-                    # It was stopped between the check and the frame, which may have undone that.
+                    # An axis was stopped between check and frame; the frame may have undone that.
                     self._stops.current = None
                     self._stops.begin(enabled, holds=True)
                     return
@@ -512,7 +511,7 @@ class Envelope:
                 self._stops.end_hold(axis)
 
     def _prove_watchdogs(self, enables: Mask) -> None:
-        """See to it that the watchdogs are still there before axes are enabled: a node may have restarted."""
+        """Verify that the watchdogs are still set before axes are enabled: a node may have restarted."""
         if not np.any(enables & ~self._axes.live):
             return
         self._watchdogs.check()
@@ -521,7 +520,7 @@ class Envelope:
             self._arm()
 
     def _finds_live(self, where: Mask) -> bool:
-        """Return whether an axis that is about to be changed is live, enabled by another program or master."""
+        """Return whether an axis about to be changed is live because another program or master has enabled it."""
         status = self._known.find(STATUSWORD)
         return any(cia402.is_live(self._drives.read_raw(status, int(axis))) for axis in np.flatnonzero(where))
 
@@ -558,7 +557,7 @@ class Envelope:
         signals.guard(self)
 
     def _lend(self) -> None:
-        """Lend the drives limits that are tighter than their own, and ramps where a stop would let them coast."""
+        """Lend the drives limits that are tighter than their own, and ramps for stops by which they would coast."""
         self._limits.lend()
         self._stops.make_sure_of_ramps()
 
@@ -567,13 +566,13 @@ class Envelope:
         signals.release(self)
 
     def _brake(self, axes: Mask) -> None:
-        """Bring axes that turn to rest before their voltage is taken away; then it is."""
-        rest = self._limits.bounds().rest  # also how a speed counts that is looked at
+        """Stop axes that turn; their voltage is cut once they are at rest."""
+        rest = self._limits.bounds().rest  # also updates the conversion of speeds for the look below
         if self._drives.is_dry or not self._watch.look_for_live():
             return
         turning = axes & self._axes.live & (np.maximum(np.abs(self._axes.speed), np.abs(self._axes.velocity)) > rest)
         if turning.any():
-            self._arm()  # also axes that another program has enabled, once they are ours to stop
+            self._arm()  # also for axes enabled by another program, which must be stopped here, too
             with self._axes.lock:
                 self._stops.begin(turning, holds=False)
             self._watch.await_stop()
@@ -581,7 +580,7 @@ class Envelope:
 
 @contextlib.contextmanager
 def swinging_allowed(drives: Drives) -> Iterator[None]:
-    """Have the envelope of drives, if they have one, take current that swings for intended; its other limits stay."""
+    """Disable the oscillation detector of the drives' envelope, if they have one; the other limits stay."""
     envelope = drives.safety
     if envelope is None:
         yield

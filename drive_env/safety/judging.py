@@ -20,21 +20,22 @@ from drive_env.safety.rotor import wrapped
 from drive_env.safety.stop_ends import StopEnds, by_position, ends_by_itself, is_led, sees_demand
 from mechanics.arrays import Floats, Integers, Mask
 
-# A current above its limit is no accident until it lasts: noise and overshoot are within this.
+# A current above its limit is an accident only if it lasts: noise and overshoot are shorter.
 CURRENT_MARGIN, CURRENT_CYCLES = 1.25, 10
-MODE_SETTLES = 0.05  # s after a mode was written, within which a drive may not be heard yet
+MODE_SETTLES = 0.05  # s after a mode was written, during which a drive may ignore commands
 
 
 class Judging:
-    """Whether samples are within the limits.
+    """Checks whether samples are within the limits.
 
     Args:
         known: The drives' objects.
-        axes: What is known of the axes.
-        limits: Those that hold.
+        axes: Their present state.
+        limits: The limits in force.
         modes: Returns the mode of operation of every axis.
-        stop_for: Stops the drives for what is wrong, and raises SafetyError with that and a remedy.
-        mode_gate: The drive's own mode, of one that takes no commands unless it fits the mode of operation.
+        stop_for: Stops the drives, and raises SafetyError with the cause and a remedy.
+        mode_gate: The manufacturer's mode object, if the drive ignores commands unless it matches the mode of
+            operation; else None.
     """
 
     def __init__(
@@ -76,9 +77,9 @@ class Judging:
             self._judge_current(judged, rows[CURRENT], bounds)
 
     def judge_heard(self, rows: Mapping[Key, Integers], were_judged: Mask) -> None:
-        """Stop axes that have ceased to take commands because another program has changed one of their modes.
+        """Stop axes that no longer take commands because another program has changed one of their modes.
 
-        Such an axis stops by itself, or runs on: the manual of a drive may not say which.
+        Such an axis may stop or run on: the drive's manual may not say which.
 
         Args:
             rows: Samples, each object of shape (rows, num_axes).
@@ -96,7 +97,7 @@ class Judging:
             )
 
     def _judge_speed(self, judged: Mask, bounds: Bounds) -> None:
-        """Hold speeds by positions against the limit of drives whose own unit of speed is not known."""
+        """Check speeds computed from positions, for drives whose own unit of speed is unknown."""
         if (wrong := np.flatnonzero(judged & (np.abs(self._axes.speed) > bounds.speed))).size:
             axis = int(wrong[0])
             self._stop_for(
@@ -121,7 +122,7 @@ class Judging:
             np.where(bounds.low > -NO_LIMIT, bounds.low - low, 0),
             np.where(bounds.high < NO_LIMIT, high - bounds.high, 0),
         )
-        # An axis that was enabled outside may come back, though not go further out.
+        # An axis that was enabled outside its limits may come back, but not go further out.
         self._axes.outside = np.where(self._axes.outside < 0, outside[0], self._axes.outside)
         slack = np.where(will_be > outside.max(axis=0), bounds.slack, bounds.settled)
         allowed = self._axes.outside + slack
@@ -140,10 +141,10 @@ class Judging:
             )
 
     def _ways(self, bounds: Bounds) -> tuple[Floats, Floats]:
-        """Return how far the axes go on, if they are stopped now: by their speed, and by the one asked for [inc]."""
+        """Return how far the axes go on if stopped now [inc]: by their actual speed, and by their commanded speed."""
         axes, speed = self._axes, self._stop_ends.speed
         own, asked = self._stop_ends.ways(bounds)
-        # What ends by itself is as near to its end as the steepest ramp of a profile says, whatever a stop would do.
+        # An axis that ends at its set-point needs only the way of its profile's steepest ramp, not that of a stop.
         known = bounds.profile > 0.0
         profile = np.sign(speed) * speed**2 / (2.0 * np.where(known, bounds.profile, 1.0)) * known
         ends = ends_by_itself(axes, bounds)
@@ -154,7 +155,7 @@ class Judging:
 
     def _judge_following(self, judged: Mask, error: Integers, bounds: Bounds) -> None:
         largest: Integers = np.abs(wrapped(error)).max(axis=0)
-        # The mode is an SDO transfer away: asked for only where it matters.
+        # Reading the mode costs an SDO transfer: only where it matters.
         if not np.any(judged & (largest > bounds.following)):
             return
         follows = np.isin(self._modes(), (PP, *LED_MODES))

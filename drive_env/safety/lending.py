@@ -1,7 +1,7 @@
-"""Limits that the drives hold themselves while they are moved; afterwards they get their own back.
+"""Values lent to drives: tighter limits written to them while they are moved; they get their own back afterwards.
 
-A limit that lives in this process alone dies with it. What is tighter here than in a drive is lent to it: the drive
-holds it, and the program goes on reading and writing its own value, which the drive has again afterwards.
+A limit that lives in this process alone dies with it. So a limit that is tighter here than in the drive is written to
+the drive. The program goes on reading and writing its own value, which the drive gets back afterwards.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ logger = logging.getLogger(__name__)
 
 
 class Loan(NamedTuple):
-    """An object's own value, and the values that it may have meanwhile: several where an answer was lost."""
+    """An object's own value, and the values lent in its place: several after an answer was lost."""
 
     own: int
     lent: frozenset[int]
 
 
 class Lending:
-    """Objects that have another value for a while.
+    """Objects with a lent value.
 
     Args:
         drives: The drives.
 
     Attributes:
-        left_alone: Axes that are not moved here: they keep their values.
+        left_alone: Axes that this program does not move: nothing is lent to them.
     """
 
     def __init__(self, drives: WatchedDrives) -> None:
@@ -44,20 +44,17 @@ class Lending:
         self._loans: dict[tuple[Key, int], Loan] = {}
 
     def lend(self, key: Key, axis: int, value: int) -> bool:
-        """Give an object of an axis a value for a while; return whether the drive, read back, has it.
-
-        An axis that is left alone needs none.
-        """
+        """Lend a value to an object of an axis. True if the drive, read back, has it or the axis is left alone."""
         if axis in self.left_alone:
             return True
         entry, loan = self._drives.description.dictionary.find(key), self._loans.get((key, axis))
         try:
             own = int(self._drives.read_raw(entry, axis)) if loan is None else loan.own
-            # Noted first: an answer that is lost does not say which of them the drive has.
+            # Noted before the write: if its answer is lost, the drive may have either value.
             self._loans[key, axis] = Loan(own, frozenset({value}) | (frozenset() if loan is None else loan.lent))
             self._drives.write_raw(entry, axis, value)
             found = int(self._drives.read_raw(entry, axis))
-            # What a drive makes of a value, at the end of its own range say, is lent as well, and taken back.
+            # If the drive clips the value, say to its range, the clipped value counts as lent and is taken back.
             self._loans[key, axis] = Loan(own, frozenset({found}))
             if found == value:
                 return True
@@ -76,7 +73,7 @@ class Lending:
         return False
 
     def own(self, key: Key, axis: int, found: int) -> int:
-        """Return the program's own value of an object that reads `found`: where another is lent, the one before."""
+        """Return the program's own value of an object; `found`, the value read, if none is lent."""
         loan = self._loans.get((key, axis))
         return loan.own if loan is not None and found in loan.lent else found
 
@@ -85,7 +82,7 @@ class Lending:
         return self._loans[key, axis].own
 
     def is_lent(self, key: Key, axis: int) -> bool:
-        """Return whether an object has another value meanwhile."""
+        """Return whether an object has a lent value."""
         return (key, axis) in self._loans
 
     def settle(self, key: Key, axis: int, value: int) -> None:
@@ -93,7 +90,7 @@ class Lending:
         self._loans[key, axis] = self._loans[key, axis]._replace(own=value)
 
     def pass_on(self, key: Key, axis: int, value: int) -> None:
-        """Write the program's value of an object that had a lent one: it has it now and afterwards.
+        """Write the program's value to an object in place of the lent one, as its own value from now on.
 
         Raises:
             ObjectAccessError: If the drive refuses it; BusError if it does not answer.
@@ -102,10 +99,10 @@ class Lending:
         self._loans[key, axis] = Loan(value, frozenset({value}))
 
     def give_back(self, axes: set[int]) -> None:
-        """Give axes their own values back.
+        """Restore the own values of axes.
 
         Raises:
-            BusError: If not all of it could be.
+            BusError: If not all of them could be restored.
         """
         tidying = Tidying()
         for (key, axis), loan in list(self._loans.items()):
@@ -115,11 +112,11 @@ class Lending:
         tidying.end()
 
     def give_back_one(self, key: Key, axis: int) -> None:
-        """Give an object of an axis its own value back."""
+        """Restore the own value of an object of an axis."""
         self._return(self._drives.description.dictionary.find(key), axis, self._loans[key, axis])
 
     def has_lent(self, axes: set[int]) -> bool:
-        """Return whether any object of axes has another value meanwhile."""
+        """Return whether any object of axes has a lent value."""
         return any(axis in axes for _, axis in self._loans)
 
     def forget(self, axes: set[int]) -> None:
@@ -129,7 +126,7 @@ class Lending:
                 del self._loans[key, axis]
 
     def _return(self, entry: Entry, axis: int, loan: Loan) -> None:
-        # Who else has changed it meanwhile had a reason.
+        # If another program has changed the value meanwhile, its value stays.
         if int(self._drives.read_raw(entry, axis)) in loan.lent:
             self._drives.write_raw(entry, axis, loan.own)
             if (found := int(self._drives.read_raw(entry, axis))) != loan.own:

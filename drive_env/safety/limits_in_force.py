@@ -1,4 +1,4 @@
-"""The limits that hold now: the user's as places of the rotors, the drives' own besides, and lent where tighter."""
+"""The limits in force: the user's, as rotor positions, and the drives' own; the tighter ones are lent to the drives."""
 
 from __future__ import annotations
 
@@ -35,42 +35,42 @@ if TYPE_CHECKING:
     from drive_env.safety.watched_drives import WatchedDrives
 
 
-STOP_WITHIN = 1.0  # s from the highest speed allowed by the quick stop's ramp; what ramps slower may turn no faster
+STOP_WITHIN = 1.0  # s from the highest allowed speed by the quick stop's ramp; a slower ramp lowers that speed
 
 
 def bound_text(bound: np.int64) -> str:
-    """Return an end of a range for a message."""
+    """Return one end of a range as text for a message."""
     return "(none)" if abs(int(bound)) >= NO_LIMIT else str(int(bound))
 
 
 class LimitsInForce:
-    """The limits of the axes at the scale and zero that they have now.
+    """The limits of the axes at their present scale and zero.
 
     Args:
-        user: What the user allows.
+        user: The user's limits.
         drives: The drives.
-        axes: What is known of them.
-        lending: What holds the limits that are tighter than the drives' own.
+        axes: Their present state.
+        lending: Lends the drives limits that are tighter than their own.
 
     Attributes:
-        user: What the user allows.
-        latest: The limits as they were read last; None since something changed that they depend on.
+        user: The user's limits.
+        latest: The limits as last read; None after a change of an object that they depend on.
     """
 
     def __init__(self, user: Limits, drives: WatchedDrives, axes: Axes, lending: Lending) -> None:
         self.user = user
         self.latest: Bounds | None = None
         self._generation = 0
-        self._must_place = False  # before a limit is used
+        self._must_place = False  # before the next use of a limit
         self._drives = drives
         self._axes = axes
         self._lending = lending
         self._has_vl_ramp = any(drives.description.has(key) for key in VL_BRAKING)
-        self._in_vl = np.zeros(drives.num_axes, bool)  # as the limits were read last
+        self._in_vl = np.zeros(drives.num_axes, bool)  # when the limits were last read
         self._of_rotors = self._capture()
 
     def change(self, user: Limits) -> None:
-        """Take other limits, as the rotors' own at the scale and zero of now."""
+        """Replace the user's limits, converted to revolutions at the present scale and zero."""
         self.user = user
         self._of_rotors = self._capture()
         self.forget()
@@ -78,12 +78,12 @@ class LimitsInForce:
             self.lend()
 
     def forget(self) -> None:
-        """Read anew the values that the limits depend on, before they are used again."""
+        """Have the limits read anew before their next use."""
         self._generation += 1
         self.latest = None
 
     def keep_place(self) -> None:
-        """Note where the rotors are before an object is written that moves their scale; `place` is called after it."""
+        """Keep the rotor angles before an object is written that changes the scale; `place` is called after it."""
         position, scale = read_own(self._drives, POSITION, 0), read_scale(self._drives)
         ratios = read_ratios(self._drives)
         with self._axes.lock:
@@ -92,12 +92,12 @@ class LimitsInForce:
             self._axes.keep_place()
 
     def place_again(self) -> None:
-        """Have the rotors placed again before a limit is used: the scale of a drive may have changed."""
+        """Have the rotor angles read anew before a limit is used: the scale of a drive may have changed."""
         self._must_place = True
         self.forget()
 
     def _capture(self) -> RotorLimits:
-        """Return the user's limits as the rotors' own, at the scale and zero of now."""
+        """Return the user's limits in revolutions, at the present scale and zero."""
         user = self.user
         if not self._drives.description.has(POSITION):
             for name, value in (("position", user.position), ("following_error", user.following_error)):
@@ -111,7 +111,7 @@ class LimitsInForce:
         return rotor_limits(user, self._drives, self._axes.rotor, self._axes.position)
 
     def place(self) -> None:
-        """Read where the rotors are and the scale of a revolution; changes of scale or zero have not moved them."""
+        """Read positions and scales; a change of scale or zero has not moved the rotors."""
         position = read_own(self._drives, POSITION, 0)
         scale, ratios = read_scale(self._drives), read_ratios(self._drives)
         with self._axes.lock:
@@ -123,7 +123,7 @@ class LimitsInForce:
             self.lend()
 
     def bounds(self) -> Bounds:
-        """Return the limits of every axis as integers of its drive; those left open by the user are the drives' own."""
+        """Return the limits of every axis as integers of its drive; the drives' own where the user gave none."""
         bounds, generation = self.latest, self._generation
         if self._has_vl_ramp and np.any(self._in_vl != (self._axes.mode == VL)):
             bounds, self._in_vl = None, self._axes.mode == VL
@@ -132,11 +132,11 @@ class LimitsInForce:
                 self.place()
             in_vl = self._in_vl if self._has_vl_ramp else None
             bounds = read_bounds(self.user, self._drives, self._axes.rotor, self._of_rotors, in_vl)
-            # A whole number of counts, but for rounding where they are rpm.
+            # The limit is a whole number of counts, except for rounding if it is in rpm.
             counts = np.floor(bounds.braking * STOP_WITHIN / np.nan_to_num(bounds.count, nan=1.0) + 1e-6)
             ramp = np.where(bounds.braking > 0.0, counts, float(NO_LIMIT))
             bounds.velocity = np.minimum(bounds.velocity, np.minimum(ramp, float(NO_LIMIT)).astype(np.int64))
-            if generation == self._generation:  # else something changed while another thread's answers were read
+            if generation == self._generation:  # otherwise something changed while another thread's answers were read
                 self.latest = bounds
                 self._axes.speed_count = bounds.count
         return bounds
@@ -179,10 +179,11 @@ class LimitsInForce:
         assert entry.low is not None and entry.high is not None, "a limit is a number"
         try:
             own = int(self._drives.read_axis(entry, axis))
-        except RefusedError:  # the EDS lists what the drive has not: the envelope alone watches then
+        except RefusedError:  # the EDS lists an object that the drive lacks: the envelope alone monitors this limit
             return
         switched_off = own == 0 and key in (FOLLOWING_WINDOW, MAX_PROFILE_VELOCITY, MAX_MOTOR_SPEED)
-        # An empty range becomes one by either end: the other is lent as well, if need be as far as the type goes.
+        # Lending one end alone could leave the range empty: the other is lent as well, if need be as the end of its
+        # type.
         no_range = key in (POSITION_LOW, POSITION_HIGH) and self._has_no_range(axis)
         value = max(min(limit, float(entry.high)), float(entry.low))
         tighter = value < own if is_upper else value > own

@@ -21,24 +21,24 @@ if TYPE_CHECKING:
     from drive_env.safety.watched_drives import WatchedDrives
 
 
-UNSAMPLED = 0.010  # s between two looks at what no PDO carries
-ASK, ASK_AGAIN = 0.015, 0.010  # s for an answer to a look, where time passes, and of one that was silent before
-SILENT = 0.05  # s for which one that did not answer is not asked again: it must not hold up the others
+UNSAMPLED = 0.010  # s between two reads of objects that no PDO carries
+ASK, ASK_AGAIN = 0.015, 0.010  # s to wait for an answer in real time, and for that of a node that was silent before
+SILENT = 0.05  # s before a silent node is asked again: it must not hold up the others
 
 
 def answer_time(drives: WatchedDrives, usual: float = ASK) -> float:
-    """Return how long to wait for an answer to a look [s]: where time waits, nothing runs on meanwhile."""
+    """Return how long to wait for an answer [s]; in lockstep longer, since nothing moves meanwhile."""
     return drives.description.answer_timeout if drives.time_waits else usual
 
 
 class Looks:
-    """The objects that come with every SYNC, and those that are read besides.
+    """The objects that come with every SYNC, and those that are read separately.
 
     Args:
         drives: The drives.
-        axes: What is known of them.
-        limits: Those that hold.
-        observe: Takes what an axis answered: rows, the epoch when it was asked, which axis.
+        axes: Their present state.
+        limits: The limits in force.
+        observe: Called with an axis' answers: rows, the epoch of the request, the axis.
     """
 
     def __init__(
@@ -88,11 +88,11 @@ class Looks:
         """Note the objects that come with every SYNC; the other watched ones are read."""
         self._unsampled = [entry for entry in self.watched() if entry not in chosen]
         keys = [(entry.index, entry.sub) for entry in self._unsampled]
-        if DEMAND in keys and POSITION not in keys:  # a following error needs both of the same moment
+        if DEMAND in keys and POSITION not in keys:  # a following error needs both at the same moment
             self._unsampled.insert(0, self._known.find(POSITION))
 
     def with_unsampled(self, rows: Mapping[Key, Integers]) -> Mapping[Key, Integers]:
-        """Return samples with the objects that no PDO carries, read now and then: no time passes in lockstep."""
+        """Return samples together with the last read values of objects that no PDO carries."""
         count = len(next(iter(rows.values()))) if rows else 1
         if self._axes.clock + count * self._drives.description.cycle < self._unsampled_at:
             return rows
@@ -104,9 +104,9 @@ class Looks:
         return {**asked, **rows}
 
     def ask(self, entries: Sequence[Entry]) -> bool:
-        """Read objects of every axis; return whether all came. Beyond a limit the drives are stopped.
+        """Read objects of every axis; return whether all answered. Beyond a limit the drives are stopped.
 
-        Nodes that have not answered come last, one of them at a time, so that the others do not wait for them.
+        Nodes that did not answer before come last, one of them per call, so that the others do not wait for them.
         """
         now = self._axes.now()
         due = [node for node, until in self._silent.items() if until <= now][:1]
@@ -129,7 +129,7 @@ class Looks:
             if rows:
                 self._observe(rows, epoch, where)
             if len(rows) < len(entries):
-                self._silent.pop(node, None)  # it goes to the end of those that are asked again
+                self._silent.pop(node, None)  # moves it to the end of those asked again
                 self._silent[node] = self._axes.now() + SILENT
                 return False
         self._silent.pop(node, None)

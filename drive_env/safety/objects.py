@@ -20,13 +20,13 @@ POSITION_OFFSET, VELOCITY_OFFSET, TORQUE_OFFSET = (
 )
 VL_TARGET, VL_VELOCITY = (cia402.VL_TARGET_VELOCITY, 0), (cia402.VL_VELOCITY_ACTUAL, 0)
 VL_MAX = (cia402.VL_VELOCITY_LIMITS, 2)
-# A speed, and the time over which it is lost: by "disable operation", and by a quick stop.
+# A speed, and the time to lose it: for "disable operation", and for a quick stop.
 VL_DECELERATION, VL_QUICK_STOP = (
     ((cia402.VL_DECELERATION, 1), (cia402.VL_DECELERATION, 2)),
     ((cia402.VL_QUICK_STOP, 1), (cia402.VL_QUICK_STOP, 2)),
 )
 VL_REFERENCE = (cia402.VL_REFERENCE, 0)
-# Instead of each, where it has no speed: 604Eh, and the time over which that is lost, in ms.
+# If a ramp's speed is 0: 604Eh, and the time to lose that speed, in ms.
 VL_BY_TIME = {
     VL_DECELERATION: (VL_REFERENCE, (cia402.VL_SLOW_DOWN_TIME, 0)),
     VL_QUICK_STOP: (VL_REFERENCE, (cia402.VL_QUICK_STOP_TIME, 0)),
@@ -48,16 +48,16 @@ DISABLE_OPERATION_OPTION, HALT_OPTION, FAULT_REACTION_OPTION = (
     (cia402.HALT_OPTION, 0),
     (cia402.FAULT_REACTION_OPTION, 0),
 )
-# What makes an axis move, or changes how far: writing one arms the envelope.
+# Objects that make an axis move or change how far it goes: writing one arms the envelope.
 SET_POINTS = (
     TARGET_POSITION, TARGET_VELOCITY, TARGET_TORQUE, POSITION_OFFSET, VELOCITY_OFFSET, TORQUE_OFFSET,
     INTERPOLATED_POSITION, VL_TARGET,
 )  # fmt: skip
 
 PP, VL, PV, HM, IP, CSP, CSV = 1, 2, 3, 6, 7, 8, 9  # modes of operation
-LED_MODES = (IP, CSP)  # by a position in each cycle
+LED_MODES = (IP, CSP)  # commanded by a position in each cycle
 TORQUE_MODES = (4, 10)
-UNRAMPED_MODES = (4, *LED_MODES, 10)  # tq, ip, csp, cst: no object says how fast what they command may become
-# What sets the speed of a mode, sums in brackets: from when the mode is on, and from when a move is started.
+UNRAMPED_MODES = (4, *LED_MODES, 10)  # tq, ip, csp, cst: no object limits the speed that they reach
+# Objects that set the speed of a mode (sums in brackets): while the mode is on, and when a move is started.
 RUNNING_SPEEDS = {VL: ((VL_TARGET,),), PV: ((TARGET_VELOCITY,),), CSV: ((TARGET_VELOCITY, VELOCITY_OFFSET),)}
 MOVING_SPEEDS = {PP: ((PROFILE_VELOCITY,),), HM: ((HOMING_SPEED_TO_SWITCH,), (HOMING_SPEED_TO_ZERO,))}

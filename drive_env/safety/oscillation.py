@@ -1,11 +1,11 @@
-"""Does a loop shake? Told by how often its current swings from one side to the other."""
+"""Detects an oscillating loop by how often its current swings from one side to the other."""
 
 from __future__ import annotations
 
 from collections import deque
 
-# An oscillation: the current swings past plus and minus half its limit this often within the window. Bringing a load
-# from speed to speed swings it once or twice; a loop that shakes does it at every period, 40 Hz and more.
+# An oscillation: the current swings past plus and minus half its limit SWINGS times within the window. A change of
+# speed of the load swings it once or twice; an oscillating loop once per period, at 40 Hz and more.
 SWING, SWINGS, SWING_WINDOW = 0.5, 8, 100  # [1], [1], [cycles]
 
 
@@ -18,7 +18,7 @@ class Swings:
         self._times: deque[int] = deque()
 
     def count(self, current: int, threshold: float) -> int:
-        """Take a sample; return the swings within the window."""
+        """Add a sample; return the number of swings within the window."""
         self._cycle += 1
         side = 1 if current > threshold else -1 if current < -threshold else 0
         if side and side != self._side:

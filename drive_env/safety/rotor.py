@@ -17,35 +17,35 @@ if TYPE_CHECKING:
     from drive_env.safety.watched_drives import WatchedDrives
 
 
-TURN = 65536.0  # increments of a revolution of drives without a position
+TURN = 65536.0  # increments per revolution assumed for drives without a position
 HOME_OFFSET = (cia402.HOME_OFFSET, 0)
 
 
 def wrapped(difference: Integers) -> Integers:
-    """Return differences of positions that count on past the end of 32 bits."""
+    """Return differences of positions, corrected where the 32-bit position has wrapped."""
     result: Integers = (difference + 2**31) % 2**32 - 2**31
     return result
 
 
 class RotorAngle:
-    """The way between increments of 6064h and revolutions of the rotors.
+    """Converts between increments of 6064h and revolutions of the rotors.
 
-    Positions are those of a moment (`place`) and the increments since; place rotors anew after scale or zero changed.
+    Angles are counted from a reference (`place`) in increments since; call `place` again after scale or zero changed.
 
     Args:
-        num_axes: How many.
+        num_axes: Number of axes.
     """
 
     def __init__(self, num_axes: int) -> None:
         self._increments = np.zeros(num_axes, np.int64)
         self._turns = np.zeros(num_axes)
-        self.scale = np.ones(num_axes)  # increments per revolution; 1 where the drive does not say
-        self.ratio = np.ones(num_axes)  # rpm of a velocity unit, of drives that have such
-        self.set_point_ratio = np.ones(num_axes)  # velocity units of a target of vl, of drives that have 604Bh
+        self.scale = np.ones(num_axes)  # increments per revolution; 1 if unknown
+        self.ratio = np.ones(num_axes)  # rpm of a velocity unit; 1 without such a unit
+        self.set_point_ratio = np.ones(num_axes)  # velocity units of a target of vl; 1 without 604Bh
         self.is_placed = False
 
     def place(self, increments: Integers, scale: Floats, turns: Floats | None = None) -> None:
-        """Note that rotors are at `turns` where 6064h shows `increments`; where they were believed by default."""
+        """Set the reference: rotors are at `turns` (default: as computed) where 6064h shows `increments`."""
         if turns is None:
             turns = self.turns(increments) if self.is_placed else np.zeros(len(increments))
         self._increments, self._turns, self.scale = increments.copy(), turns.copy(), scale.copy()
@@ -69,7 +69,7 @@ def _own_scale(description: Description) -> PositionScale | None:
 
 
 def scale_objects(description: Description) -> tuple[Key, ...]:
-    """Return the objects that say how many increments a revolution has, and how many rpm a unit of velocity."""
+    """Return the objects that give the increments per revolution and the rpm of a velocity unit."""
     roles = description.dictionary.roles
     ratios = (_there(description, ratio) for ratio in (velocity_ratio(roles), set_point_ratio(roles)))
     return _position_objects(description) + tuple(key for ratio in ratios if ratio is not None for key in ratio.keys)
@@ -80,7 +80,7 @@ def _there(description: Description, ratio: PositionScale | None) -> PositionSca
 
 
 def read_ratios(drives: WatchedDrives) -> tuple[Floats, Floats]:
-    """Return the rpm of a velocity unit of every axis, and the velocity units of a target of vl; 1 without such."""
+    """Return the rpm of a velocity unit and the velocity units of a target of vl, of every axis; 1 if it has none."""
     roles = drives.description.dictionary.roles
     return _read(drives, velocity_ratio(roles)), _read(drives, set_point_ratio(roles))
 
@@ -94,7 +94,7 @@ def _read(drives: WatchedDrives, ratio: PositionScale | None) -> Floats:
 
 
 def _position_objects(description: Description) -> tuple[Key, ...]:
-    """Return the objects that say how many increments a revolution has."""
+    """Return the objects that give the increments per revolution."""
     own = _own_scale(description)
     if own is not None:
         return own.keys
@@ -106,9 +106,9 @@ def _position_objects(description: Description) -> tuple[Key, ...]:
 
 
 def read_scale(drives: WatchedDrives) -> Floats:
-    """Return the increments of a revolution of every axis; nan where the drive does not say.
+    """Return the increments per revolution of every axis; nan if the drive does not report them.
 
-    A drive that shows the speed of vl and no position has none: it shows rpm, counted in parts of a turn of ours.
+    A drive that shows the speed of vl and no position has none: its rpm are counted in `TURN` parts of a revolution.
     """
     has = drives.description.has
     if has((cia402.VL_VELOCITY_ACTUAL, 0)) and not has((cia402.POSITION_ACTUAL, 0)):
@@ -117,7 +117,7 @@ def read_scale(drives: WatchedDrives) -> Floats:
     known = drives.description.dictionary
     try:
         values = [drives.read_entry(known.find(key)).astype(float) for key in keys]
-    except RefusedError:  # the EDS has what the drive has not
+    except RefusedError:  # the EDS lists an object that the drive lacks
         values = []
     own = _own_scale(drives.description)
     if own is not None and values:

@@ -20,7 +20,7 @@ class Guarded(Protocol):
         """Begin to stop; return whether a stop that a signal before began is still under way."""
 
     def carry_on(self) -> None:
-        """Note that the program continues in spite of the signal."""
+        """Note that the program continues despite the signal."""
 
 
 _guarded: list[Guarded] = []
@@ -28,7 +28,7 @@ _before: dict[int, Any] = {}
 
 
 def guard(one: Guarded) -> None:
-    """Have signals stop this one first. Only the main thread can; elsewhere the drives' watchdogs must do."""
+    """Stop this one first at a signal. Only the main thread can; elsewhere the drives' watchdogs must do."""
     if threading.current_thread() is not threading.main_thread():
         return
     if one not in _guarded:
@@ -45,7 +45,7 @@ def guard(one: Guarded) -> None:
 
 
 def release(one: Guarded) -> None:
-    """Undo `guard`; the last one gives the signals back."""
+    """Undo `guard`; after the last one the previous signal handlers are restored."""
     if one in _guarded:
         _guarded.remove(one)
     if _guarded or threading.current_thread() is not threading.main_thread():
@@ -58,7 +58,7 @@ def release(one: Guarded) -> None:
 
 def _handle(number: int, frame: FrameType | None) -> None:
     guarded = list(_guarded)
-    under_way = [one.interrupt() for one in guarded]  # all of them must hear
+    under_way = [one.interrupt() for one in guarded]  # a list: every one must be interrupted
     if any(under_way):
         return
     before = _before.get(number, signal.SIG_DFL)

@@ -1,4 +1,4 @@
-"""Stops of some drives: which axes, their drives' settings meanwhile, and the cases left to the watchdogs."""
+"""Runs the stops of some drives: which axes, the values lent meanwhile, and the axes left to the watchdogs."""
 
 from __future__ import annotations
 
@@ -44,19 +44,19 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 
-WEIGHT_LOOK, WEIGHT_SHARE = 0.06, 0.03  # s at rest; of the current limit, above which it may be a weight
+WEIGHT_LOOK, WEIGHT_SHARE = 0.06, 0.03  # s at rest; share of the current limit above which it may be a weight
 WAKE_PERIOD = 0.2  # s
 COASTS = 0  # the option code that lets an axis coast
-# Options of a stop that would let an axis coast, or ramp as its profiles do, however long that takes, and what is lent
-# instead: the ramp of a quick stop (6085h), by which stopping distances are predicted, where there is a choice.
+# Options of a stop that would let an axis coast or ramp by its profile, however long that takes, and the options lent
+# instead: a quick stop's ramp (6085h), by which stopping distances are predicted, if there is a choice.
 RAMPS = {
     QUICK_STOP_OPTION: {COASTS: 2, 1: 2, 5: 6},
     DISABLE_OPERATION_OPTION: {COASTS: 1},
     HALT_OPTION: {COASTS: 1},
     FAULT_REACTION_OPTION: {COASTS: 2, 1: 2},
 }
-# What "disable operation" may ramp by, and in which modes: in all of them 6084h; some drives have one ramp for both
-# ways in pv, and another in hm and vl.
+# The ramps that "disable operation" may use, and in which modes: 6084h in all; some drives use one ramp for both
+# directions in pv, and another in hm and vl.
 SLOW_DOWN_RAMPS = {
     (cia402.PROFILE_DECELERATION, 0): (),
     (cia402.PROFILE_ACCELERATION, 0): (PV,),
@@ -68,17 +68,17 @@ _ENDS_HELD = {1: 5, 2: 6}
 
 
 class StopRunner:
-    """The stop that is under way, if one is.
+    """The stop that is under way, if any.
 
     Args:
         drives: The drives.
-        axes: What is known of them; hold its lock to begin or step a stop.
-        limits: Those that hold.
+        axes: Their state; hold its lock to begin or step a stop.
+        limits: The limits in force.
         lending: Lends the drives another quick stop option.
-        cease: Ends the heartbeats, so that what is lost stops by itself.
+        cease: Ends the heartbeats, so that unreachable drives stop by themselves.
 
     Attributes:
-        current: The stop; None when nothing is held.
+        current: The stop; None if no axis is stopping or held.
     """
 
     def __init__(
@@ -92,18 +92,18 @@ class StopRunner:
         self._lending = lending
         self._cease = cease
         self._woken_at = 0.0
-        self._told_of: set[int] = set()  # axes that are held under a weight
-        self._opened: set[int] = set()  # axes that were told last to take commands, not which
-        self._modes: dict[int, int] = {}  # axis that ignores commands -> its mode of operation, asked for
+        self._told_of: set[int] = set()  # axes already reported as held under a weight
+        self._opened: set[int] = set()  # axes whose last write was the manufacturer's mode, not a controlword
+        self._modes: dict[int, int] = {}  # axis that ignores commands -> its mode of operation as read
         self._asked_at: dict[int, float] = {}  # axis -> when its mode was asked for [s]
-        self._beyond: dict[int, tuple[float, float]] = {}  # axis that leaves its travel by itself -> when, how fast
-        self._held: set[int] = set()  # axes whose quick stop option was looked at in this stop
+        self._beyond: dict[int, tuple[float, float]] = {}  # axis beyond its travel -> when, and how fast
+        self._held: set[int] = set()  # axes whose quick stop option was checked in this stop
 
     def make_sure_of_ramps(self) -> None:
-        """Make quick stops ramp by 6085h, and other stops ramp, too: an option code of 0 would let an axis coast.
+        """Make quick stops ramp by 6085h and other stops ramp, too: an option code of 0 would let an axis coast.
 
         Raises:
-            SafetyError: If a drive takes no other option for its quick stop.
+            SafetyError: If a drive accepts no other option for its quick stop.
         """
         for key, ramps in RAMPS.items():
             if not self._drives.description.has(key):
@@ -119,10 +119,10 @@ class StopRunner:
                 logger.warning("axis %d: %s = 0 lets it coast", axis, self._known.find(key).label)
 
     def keep_ramps(self, key: Key, raw: Integers, where: Mask) -> None:
-        """Lend axes a stop's ramp in place of an option without one that is about to be written; it is theirs later.
+        """Lend a ramp in place of an option without one that is about to be written; the drive gets that option later.
 
         Raises:
-            SafetyError: If a drive does not take the ramp.
+            SafetyError: If a drive does not accept the ramp.
         """
         if key not in RAMPS:
             return
@@ -135,7 +135,7 @@ class StopRunner:
                 )
 
     def lends_ramps(self) -> bool:
-        """Return whether an axis would coast by the drive's own option, and has a ramp lent instead."""
+        """Return whether an axis would coast by its own option and has a ramp lent instead."""
         return any(
             self._lending.is_lent(key, axis) and self._lending.owned(key, axis) == COASTS
             for key in RAMPS
@@ -143,7 +143,7 @@ class StopRunner:
         )
 
     def cuts(self, words: Integers) -> Mask:
-        """Return where controlwords take the voltage away at once, by the option of 605Ch that each axis has now."""
+        """Return where controlwords cut the voltage at once, by the present 605Ch of each axis."""
         cuts: Mask = cia402.cuts_voltage(words)
         disables = cia402.matches(words, cia402.COMMANDS["disable operation"])
         key = DISABLE_OPERATION_OPTION
@@ -154,9 +154,9 @@ class StopRunner:
         return cuts
 
     def slow_ramps(self) -> Mask:
-        """Return where "disable operation" would take an axis out of its travel, or longer than STOP_WITHIN.
+        """Return where "disable operation" would take an axis out of its travel or last longer than STOP_WITHIN.
 
-        While its ramp runs a drive need not obey a quick stop: only the voltage could be taken away.
+        A drive need not obey a quick stop during that ramp: only cutting the voltage would remain.
         """
         ramp, bounds = self._disabling_ramp(), self._limits.bounds()
         speed = np.where(np.abs(self._axes.speed) > np.abs(self._axes.velocity), self._axes.speed, self._axes.velocity)
@@ -171,10 +171,7 @@ class StopRunner:
         return self._disabling_ramp() < self._limits.bounds().braking
 
     def _disabling_ramp(self) -> Floats:
-        """Return the least deceleration that "disable operation" may have in the present mode [inc/s^2].
-
-        Infinite where it is not known.
-        """
+        """Return the lowest deceleration of "disable operation" in the present mode [inc/s^2]; inf if unknown."""
         ramp = np.full(self._drives.num_axes, np.inf)
         for key, modes in SLOW_DOWN_RAMPS.items():
             if not self._drives.description.has(key):
@@ -183,12 +180,12 @@ class StopRunner:
             own: Floats = np.asarray(read_own(self._drives, key, 0) * np.nan_to_num(count), float)
             if key in (*VL_DECELERATION, VL_REFERENCE):
                 own = read_vl_rate(self._drives, VL_DECELERATION, self._axes.rotor)
-            counts = ~np.isnan(count) & (own > 0.0 if modes else True)  # a mode without a ramp of its own has 6084h
+            counts = ~np.isnan(count) & (own > 0.0 if modes else True)  # a mode whose own ramp is 0 uses 6084h
             ramp = np.where(counts & np.isin(self._axes.mode, modes or self._axes.mode), np.minimum(ramp, own), ramp)
         return ramp
 
     def _cannot_coast(self, key: Key) -> bool:
-        """Return whether the EDS has no option that coasts."""
+        """Return whether the EDS allows no option that coasts."""
         low = self._known.find(key).low
         return low is not None and low > COASTS
 
@@ -196,7 +193,7 @@ class StopRunner:
         return np.array([self._lending.is_lent(key, axis) for axis in range(self._drives.num_axes)])
 
     def end_hold(self, axis: int) -> None:
-        """Give an axis that is enabled anew its quick stop option again, if that is a ramp."""
+        """Restore the quick stop option of an axis that is enabled anew, or lend its 6085h ramp instead."""
         if not self._lending.is_lent(QUICK_STOP_OPTION, axis):
             return
         with logged():
@@ -213,7 +210,7 @@ class StopRunner:
         raise SafetyError(f"{what}: the drives were quick-stopped; {remedy}")
 
     def begin(self, axes: Mask, *, holds: bool) -> None:
-        """Begin to stop axes, or go on with it; one that need not hold its place any more is switched off."""
+        """Begin to stop axes, or continue; an axis that need not hold its position any more is switched off."""
         now = self._axes.now()
         stop = self.current
         if stop is None:
@@ -241,9 +238,9 @@ class StopRunner:
         stop.step(now)
 
     def _follows(self, axis: int) -> bool:
-        """Return whether an axis that ends by itself had better go on: a quick stop would take it out of its travel.
+        """Return whether an axis should go on to its set-point, since a quick stop would take it out of its travel.
 
-        Out there only one that its loops brake, or bring back.
+        Outside its travel it may go on only while its loops brake it or bring it back.
         """
         bounds, axes = self._limits.latest, self._axes
         if bounds is None or not cia402.matches(int(axes.status[axis]), cia402.OPERATION_ENABLED):
@@ -264,7 +261,7 @@ class StopRunner:
         return bool(before - fast >= SHARE * bounds.braking[axis] * (now - since))
 
     def hold(self) -> None:
-        """Have axes that are stopping stay in quick stop active at first; ask those that are not heard for a mode."""
+        """Keep stopping axes in quick stop active at first; ask those that ignore commands for their mode."""
         stop = self.current
         if stop is None:
             return
@@ -287,7 +284,7 @@ class StopRunner:
                 self._modes[axis] = int(self._drives.description.decode(entry, data))
 
     def _lend_hold(self, stop: Stop) -> None:
-        """Lend an option that ends in quick stop active: without it a weight would pull an axis on."""
+        """Lend an option that ends in quick stop active: switched off, an axis would be pulled on by a weight."""
         entry, per_node = self._known.find(QUICK_STOP_OPTION), self._drives.description.num_axes
         for axis, one in list(stop.axes.items()):
             if not one.holds or one.phase is not Phase.RAMP or axis in self._held:
@@ -303,7 +300,7 @@ class StopRunner:
                     self._lending.lend(QUICK_STOP_OPTION, axis, _ENDS_HELD[option])
 
     def _release_what_no_weight_pulls(self, stop: Stop) -> None:
-        """Switch off axes that stand without current: a drive that is held may not watch over its master."""
+        """Switch off axes that stand without current: while held, a drive may not watch its master."""
         now, bounds = self._axes.now(), self._limits.latest
         for axis, one in stop.axes.items():
             if one.phase is not Phase.REST or not one.holds or one.rests_for(now) < WEIGHT_LOOK:
@@ -324,7 +321,7 @@ class StopRunner:
         node, part = divmod(axis, known.num_axes)
         entry, value = self._known.find(CONTROLWORD), word
         own_mode = self._own_mode(axis)
-        if own_mode is not None and axis not in self._opened:  # by turns, until it is heard
+        if own_mode is not None and axis not in self._opened:  # alternately, until it takes commands
             self._opened.add(axis)
             entry, value = self._known.find(Role.MODE_GATE), own_mode
         else:
@@ -333,14 +330,14 @@ class StopRunner:
             self._drives.sdo(node).command(*known.key(entry, part), known.encode(entry, value))
 
     def _own_mode(self, axis: int) -> int | None:
-        """Return the drive's own mode with which an axis that ignores commands takes them; None if it takes them."""
+        """Return the manufacturer's mode by which an axis takes commands again; None if it takes them."""
         device = self._drives.device
         if device is None or not self._ignores(axis):
             return None
         return device.mode_gate.get(self._modes.get(axis, int(self._axes.mode[axis])))
 
     def _ignores(self, axis: int) -> bool:
-        """Return whether an axis said last that it takes no commands, of a drive whose own mode may be why."""
+        """Return whether an axis last reported that it takes no commands, and its drive has a manufacturer's mode."""
         device = self._drives.device
         gated = device is not None and bool(device.mode_gate)
         return gated and not cia402.matches(int(self._axes.status[axis]), cia402.REMOTE)
@@ -349,7 +346,7 @@ class StopRunner:
         return Sample(float(self._axes.seen[axis]), int(self._axes.status[axis]), float(self._axes.speed[axis]))
 
     def step(self) -> None:
-        """Take the stop that is under way a step on."""
+        """Advance the stop under way."""
         stop = self.current
         assert stop is not None
         now = self._axes.now()
@@ -374,12 +371,12 @@ class StopRunner:
                 self._cease()
 
     def judged(self) -> Mask:
-        """Return which axes the limits are held against: those that are live and not stopping."""
+        """Return which axes are checked against the limits: live, not lost, not stopping."""
         judged = self._axes.live.copy()
         judged[list(self._axes.lost)] = False
         if self.current is not None:
             for axis, stop in self.current.axes.items():
-                # An axis that another program has enabled since is no longer ours to hold.
+                # An axis enabled by another program since then is no longer held here.
                 is_enabled = stop.is_over and cia402.matches(int(self._axes.status[axis]), cia402.OPERATION_ENABLED)
                 judged[axis] &= is_enabled
         return judged

@@ -1,6 +1,6 @@
-"""A stop by grades: the ramp of a quick stop; is the axis slowing down as the ramp says; if not, the voltage goes.
+"""A stop by grades: quick stop; check that the axis slows down by its ramp; if it does not, cut the voltage.
 
-A stop knows no bus: it is given samples and time, and says which controlword each axis needs next.
+A stop does not access the bus: it is given samples and the time, and returns the controlword that each axis needs next.
 """
 
 from __future__ import annotations
@@ -15,23 +15,23 @@ from drive_env import cia402
 REPEAT = 0.02  # s after which a command that shows no effect is sent again
 ANSWER = 0.1  # s within which a drive must have begun its ramp
 GRACE = 0.02  # s from the command to a slower axis: the bus, the drive's cycle, the loops
-SHARE = 0.5  # of the ramp's deceleration that counts as slowing down as it says
-LONGEST_FOLLOWING = 0.5  # s until the ramp of an axis begins that ends by itself
-LONGEST = 1.0  # s; an axis that would be at rest by then at the present deceleration slows down well enough, too
-# Measurements of the deceleration, one after the other, that must be too low before one was enough: a loop that was at
-# its limit of current goes on as before until the ramp has come down to the speed that there is.
+SHARE = 0.5  # of the ramp's deceleration, which counts as slowing down by it
+LONGEST_FOLLOWING = 0.5  # s until the ramp begins of an axis that may first go on to its set-point
+LONGEST = 1.0  # s; an axis that will be at rest by then at its present deceleration slows down well enough, too
+# Consecutive measurements of the deceleration that must be too low, until one was sufficient: a loop at its current
+# limit goes on as before until the ramp has come down to the actual speed.
 MEASUREMENTS = 2
-# A loop whose integral has wound up takes an axis past rest and brings it back: so much of its speed, for so long [s].
+# A loop whose integral has wound up takes an axis past rest and back: by this share of its speed, for this time [s].
 SWING_SHARE, SWING_TIME = 0.15, 0.1
 RAMP_TIMEOUT = 2.0  # s for the whole ramp
 SETTLED = 0.02  # s for which samples must show an axis at rest
-BLIND = 0.4  # s without a sample, after which the ramp is taken to be over
-BREAKS_LOOSE = 10.0  # times the speed of rest, at which an axis that is held shakes or slips
-LOST = 0.6  # s for which the voltage-off is repeated before an axis is given up
+BLIND = 0.4  # s without a sample, after which the voltage is cut
+BREAKS_LOOSE = 10.0  # times the speed of rest, above which a held axis shakes or slips
+LOST = 0.6  # s for which the voltage is cut repeatedly before an axis is given up
 
 
 class Phase(Enum):
-    """Where the stop of an axis is."""
+    """Phase of an axis' stop."""
 
     FOLLOW = "following"
     RAMP = "ramp"
@@ -42,7 +42,7 @@ class Phase(Enum):
 
 
 class Sample(NamedTuple):
-    """The present knowledge of an axis: when it was seen [s], statusword, speed [inc/s]."""
+    """The last sample of an axis: when it was seen [s], statusword, speed [inc/s]."""
 
     time: float
     status: int
@@ -53,12 +53,12 @@ class AxisStop:
     """The stop of one axis.
 
     Args:
-        now: The present [s].
-        speed: Its speed as far as it is known [inc/s].
-        deceleration: Of its quick stop ramp [inc/s^2]; 0 where it is not known.
+        now: The present time [s].
+        speed: Its speed, if known [inc/s].
+        deceleration: Of its quick stop ramp [inc/s^2]; 0 if unknown.
         rest: Speed below which it is at rest [inc/s].
-        holds: Let it stay in quick stop active, which holds its place, instead of switching it off.
-        follows: Returns whether it had better go on to its set-point before its ramp begins; None for one that had not.
+        holds: Whether it stays in quick stop active, which holds its position, instead of being switched off.
+        follows: Returns whether it should go on to its set-point before its ramp begins; None: never.
     """
 
     def __init__(
@@ -72,10 +72,10 @@ class AxisStop:
     ) -> None:
         self.phase = Phase.RAMP if follows is None else Phase.FOLLOW
         self._follows = follows
-        self.why = ""  # the voltage had to go
+        self.why = ""  # cause of cutting the voltage
         self._begun = self._since = now
         self._first = abs(speed)
-        self._way = 0.0  # sign of the speed with which it began
+        self._way = 0.0  # sign of its first speed
         self._swung: float | None = None  # when it passed rest [s]
         self._deceleration = deceleration
         self._rest = rest
@@ -83,16 +83,16 @@ class AxisStop:
         self._sent: float | None = None
         self._seen = now
         self._check: Sample | None = None
-        self._too_low, self._most = 0, MEASUREMENTS  # measurements of the deceleration in a row; once it brakes, one
+        self._too_low, self._most = 0, MEASUREMENTS  # measurements too low in a row; allowed ones, 1 once it brakes
         self.holds = holds
 
     @property
     def is_over(self) -> bool:
-        """Whether nothing more is to be done."""
+        """Whether the stop needs no further command."""
         return self.phase in (Phase.OFF, Phase.LOST) or (self.phase is Phase.REST and self.holds)
 
     def step(self, now: float, sample: Sample) -> int | None:
-        """Take the newest sample; return the controlword to send, None for none."""
+        """Handle the newest sample; return the controlword to send, or None."""
         fresh = sample.time > self._seen
         if fresh:
             self._seen = sample.time
@@ -113,15 +113,15 @@ class AxisStop:
         return self._command(now, sample)
 
     def rests_for(self, now: float) -> float:
-        """Return how long it has been at rest and held [s]."""
+        """Return for how long it has been held at rest [s]."""
         return now - self._since if self.phase is Phase.REST else 0.0
 
     def is_unseen(self, now: float) -> bool:
-        """Return whether the voltage should be cut, and the drive does not answer."""
+        """Return whether the voltage is to be cut but the drive does not answer."""
         return self.phase is Phase.CUT and now - self._seen > ANSWER
 
     def release(self) -> None:
-        """Hold it no longer: at its next step, or once it is at rest, its voltage goes."""
+        """Stop holding it: its voltage is cut at the next step, or once it is at rest."""
         self.holds = False
 
     def _watch_following(self, now: float, sample: Sample) -> None:
@@ -139,7 +139,7 @@ class AxisStop:
         self._first = max(self._first, abs(sample.speed)) if sample.time < self._begun + GRACE else self._first
         if self._way == 0.0 and abs(sample.speed) > self._rest:
             self._way = math.copysign(1.0, sample.speed)
-        if cia402.matches(sample.status, cia402.OPERATION_ENABLED):  # its ramp has not begun
+        if cia402.matches(sample.status, cia402.OPERATION_ENABLED):  # the ramp has not begun
             if now - self._begun > ANSWER:
                 self.why = "it does not obey the quick stop"
                 self._enter(Phase.CUT, now)
@@ -158,9 +158,9 @@ class AxisStop:
             self._enter(Phase.CUT, now)
 
     def _slows_down(self, now: float, sample: Sample) -> bool:
-        """Return whether the speed is where the ramp has it, swings past rest, or will be 0 within LONGEST."""
+        """Return whether the speed follows the ramp, swings past rest, or will be 0 within LONGEST."""
         elapsed = max(now - self._begun - GRACE, 0.0)
-        # Of a ramp that is not known, or too slow for this speed, only how fast the speed falls tells anything.
+        # If the ramp is unknown or too slow for this speed, only the measured deceleration counts.
         is_ramp = 0.0 < self._first <= RAMP_TIMEOUT * self._deceleration
         expected = self._first - SHARE * self._deceleration * elapsed if is_ramp else 0.0
         if self._check is None:
@@ -207,7 +207,7 @@ class Stop:
     Args:
         axes: Their stops, by number.
         send: Sends a controlword to an axis, without waiting for an answer.
-        sample: Returns what is known of an axis.
+        sample: Returns the last sample of an axis.
     """
 
     def __init__(
@@ -219,7 +219,7 @@ class Stop:
 
     @property
     def is_over(self) -> bool:
-        """Whether nothing more is to be done."""
+        """Whether no axis needs a further command."""
         return all(axis.is_over for axis in self.axes.values())
 
     def step(self, now: float) -> None:

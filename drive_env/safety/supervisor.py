@@ -1,8 +1,8 @@
-"""The thread that watches drives whatever the program does: it looks, stops, and keeps the drives' watchdogs quiet.
+"""The thread that watches the drives independently of the program: it looks, stops, and feeds the drives' watchdogs.
 
-While the program runs communication cycles, their samples are what is watched, and this thread only looks at the
-clock. While it computes, sleeps, reads or writes, this thread asks the drives itself. A program that takes the
-interpreter from it takes the master's signs of life away, too, and the drives stop by themselves.
+While the program runs communication cycles, their samples are watched, and this thread only looks at the clock. While
+the program computes, sleeps, reads or writes, this thread asks the drives itself. If the program blocks the
+interpreter, the master's signs of life end, too, and the drives stop by themselves.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from drive_env.fieldbus.errors import BusError
 logger = logging.getLogger(__name__)
 
 PERIOD = 0.004  # s between two turns
-SWITCH_INTERVAL = 0.0005  # s; a program that computes gives the interpreter up that soon, instead of after 5 ms
+SWITCH_INTERVAL = 0.0005  # s after which a computing program yields the interpreter, instead of 5 ms
 
 
 class Supervisor:
     """Runs a turn every few milliseconds.
 
     Args:
-        turn: What to do; a BusError is reported once, anything else ends the heartbeats.
-        fail: Called when a turn failed for good.
+        turn: The function to call; its BusErrors are reported once, any other exception ends the thread.
+        fail: Called when a turn has raised such an exception.
     """
 
     def __init__(self, turn: Callable[[], None], fail: Callable[[], None]) -> None:
@@ -38,7 +38,7 @@ class Supervisor:
         self._thread = threading.Thread(target=self._run, name="drive supervisor", daemon=True)
 
     def start(self) -> None:
-        """Begin."""
+        """Start the thread."""
         self._interval = sys.getswitchinterval()
         sys.setswitchinterval(min(self._interval, SWITCH_INTERVAL))
         self._thread.start()
@@ -60,14 +60,14 @@ class Supervisor:
         sys.setswitchinterval(self._interval)
 
     def _run(self) -> None:
-        told = ""  # a bus that is gone is reported once, not with every turn
+        told = ""  # a BusError is reported once, not at every turn
         while not self._ended.is_set():
             begun = time.monotonic()
             try:
                 self._turn()
                 told = ""
             except BusError as error:
-                # Signs of life that do not get out are what the drives wait for to stop by themselves.
+                # Signs of life that are not sent make the drives stop by themselves.
                 if str(error) != told:
                     told = str(error)
                     logger.error("%s", told)

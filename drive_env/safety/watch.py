@@ -1,4 +1,4 @@
-"""Watching over the drives: by every sample that comes, and by a thread of its own when the program does nothing."""
+"""Monitors the drives, by every sample that comes, and by a separate thread while the program runs no cycles."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 
-STALE, STALE_OFF = 0.008, 0.015  # s after which drives that are live, or off, are looked at
-BLIND = 0.2  # s for which a live axis cannot be seen, however it is asked, until it is stopped
-MISSED = 3  # SYNCs in a row to which a node that answers otherwise sends no samples: it is not operational
+STALE, STALE_OFF = 0.008, 0.015  # s after which live drives, and drives that are off, are looked at
+BLIND = 0.2  # s for which a live axis may be unseen, in spite of requests, before it is stopped
+MISSED = 3  # consecutive SYNCs without samples from a node that otherwise answers: it is not operational
 MOST_STOP_CYCLES = 5000  # in lockstep
-SILENT_CYCLE = 0.1  # s of lockstep that count as passed where no node answers
+SILENT_CYCLE = 0.1  # s of lockstep time counted when no node answers
 LONGEST_STOP = LONGEST_FOLLOWING + RAMP_TIMEOUT + BLIND_TIMEOUT + LOST + 2.0  # s, all grades together
-AT_ONCE = 0.1  # s after a signal within which another one means the same
+AT_ONCE = 0.1  # s after a signal within which a second one counts as the same
 
 
 class Watch:
@@ -48,16 +48,16 @@ class Watch:
 
     Args:
         drives: The drives.
-        axes: What is known of them.
-        limits: Those that hold.
+        axes: Their present state.
+        limits: The limits in force.
         stops: The stop that is under way.
-        watchdogs: What the drives do by themselves.
-        prepare: Has mapped what is watched.
-        poll: Has a SYNC answered and its samples observed; False if a node sent none, None if cycles are under way.
+        watchdogs: The drives' own watchdogs.
+        prepare: Has the watched objects mapped to PDOs.
+        poll: Sends a SYNC and has its samples observed; False if a node sent none, None if cycles are under way.
 
     Attributes:
-        looks: What comes with every SYNC, and what is asked for.
-        booted: Nodes that have restarted by themselves, by position.
+        looks: The objects that come with every SYNC, and those that are read.
+        booted: Positions of nodes that have restarted by themselves.
     """
 
     def __init__(
@@ -83,14 +83,14 @@ class Watch:
         self._judging = Judging(self._known, axes, limits, self.modes, stops.stop_for, gate)
         self.looks = Looks(drives, axes, limits, self._observe_axis)
         self._supervisor: Supervisor | None = None
-        self._has_seen_all = False  # and the supervisor looks, too; before, it only keeps the watchdogs quiet
+        self._has_seen_all = False  # from then on the supervisor looks, too; before, it only feeds the watchdogs
         self._missed = 0
         self._alive = time.monotonic()
         self._pending: SafetyError | None = None  # to be raised in the program's thread
-        self._told_at = -math.inf  # when a signal told the program to end [s]
+        self._told_at = -math.inf  # when a signal came to end the program [s]
         self._asked: str | None = None  # why another thread wants everything stopped
         self.booted: set[int] = set()
-        self._told_of: set[int] = set()  # those of them that were told of
+        self._told_of: set[int] = set()  # those of `booted` that were reported
 
     @property
     def is_supervised(self) -> bool:
@@ -98,10 +98,10 @@ class Watch:
         return self._supervisor is not None
 
     def begin(self) -> None:
-        """Start the thread, unless it runs, or time waits for the program.
+        """Start the thread, unless it runs or time waits for the program.
 
-        Until `first_look` has seen every axis it only keeps the watchdogs quiet, while the program does not stall: what
-        is read and configured before takes longer on a slow bus than a drive waits for its master.
+        Until `first_look` has seen every axis it only feeds the watchdogs, as long as the program does not stall: on a
+        slow bus the configuration before takes longer than a drive waits for its master.
         """
         if not self._drives.time_waits and self._supervisor is None:
             self._missed = 0
@@ -140,28 +140,28 @@ class Watch:
     def ask_to_stop(self, reason: str) -> None:
         """Have live axes stopped at the supervisor's next turn; callable from any thread."""
         supervisor = self._supervisor
-        if supervisor is not None:  # without one nothing is live, and what is enabled later is not meant
+        if supervisor is not None:  # without a supervisor no axis is live, and axes enabled later are not meant
             self._asked = reason
             supervisor.wake()
 
     def carry_on(self) -> None:
-        """Have the program told that a signal has stopped it, since it goes on."""
+        """Report at the program's next call that a signal has stopped it, since it continues."""
         if self.is_told_to_end:
             self._pending = SafetyError("the drives were stopped, since a signal ended the program")
 
     def forget_signal(self) -> None:
-        """Note that the program goes on after a signal: it enables an axis."""
+        """Note that the program goes on after a signal, since it enables an axis."""
         self._told_at = -math.inf
 
     @property
     def is_told_to_end(self) -> bool:
-        """Whether a signal has begun a stop that is not over."""
+        """Whether a signal has begun a stop that is still under way."""
         if time.monotonic() - self._told_at < AT_ONCE:
             return True
         return math.isfinite(self._told_at) and self._stops.current is not None and not self._stops.current.is_over
 
     def alive(self) -> None:
-        """Note that the program waits for an answer."""
+        """Reset the stall timer: the program waits for an answer."""
         if not self._is_supervisor():
             self._alive = time.monotonic()
 
@@ -169,7 +169,7 @@ class Watch:
         return self._supervisor is not None and self._supervisor.is_this_thread()
 
     def modes(self) -> Integers:
-        """Return the mode of operation of every axis, asked for unless this is the supervisor's thread."""
+        """Return the mode of operation of every axis; in the supervisor's thread the last one read."""
         if self._drives.description.has(MODE_DISPLAY) and not self._is_supervisor():
             self._axes.mode = self._drives.read_entry(self._known.find(MODE_DISPLAY))
         return self._axes.mode
@@ -211,12 +211,12 @@ class Watch:
         )
 
     def observe(self, rows: Mapping[Key, Integers], epoch: int, where: Mask | None = None) -> None:
-        """Look at samples, each object of shape (rows, num_axes); stop and raise SafetyError beyond a limit.
+        """Check samples, each object of shape (rows, num_axes); stop and raise SafetyError beyond a limit.
 
         Args:
             rows: The samples, one communication cycle apart.
-            epoch: The envelope's when they were asked for.
-            where: Axes that they are of, all by default.
+            epoch: The envelope's epoch when they were requested.
+            where: The axes that they belong to; None: all.
         """
         self.alive()
         with self._axes.lock:
@@ -252,15 +252,15 @@ class Watch:
             self._judging.judge(seen, self._stops.judged() & where)
 
     def look_for_live(self) -> bool:
-        """Return whether an axis is live, by the drives' present statuswords; one that does not answer is as before."""
+        """Return whether an axis is live by its present statusword; without an answer its last state counts."""
         keys = (STATUSWORD, POSITION, self._axes.velocity_object)
         entries = (self._known.find(key) for key in keys if self._drives.description.has(key))
-        with contextlib.suppress(SafetyError):  # the caller is about to stop; beyond a limit the stop has begun
+        with contextlib.suppress(SafetyError):  # the caller is about to stop; beyond a limit the stop has already begun
             self.looks.ask(list(entries))
         return bool(self._axes.may_turn.any())
 
     def await_stop(self, *, ends: bool = False) -> None:
-        """Return when a stop that is under way is over: the program's next call must not cut it short."""
+        """Wait until a stop under way is over: the program's next call must not cut it short."""
         stop = self._stops.current
         if stop is None:
             return
@@ -289,7 +289,7 @@ class Watch:
             self._stops.current = None
 
     def _pass_cycle(self) -> None:
-        """Let a cycle of lockstep pass, and look at the axes that answer."""
+        """Let one cycle of lockstep pass, and look at the axes that answer."""
         try:
             self._drives.pass_cycle()
         except BusError as error:
@@ -304,10 +304,10 @@ class Watch:
 
     # --- the supervisor's thread -------------------------------------------------------------------------------------
     def _turn(self) -> None:
-        """Take a turn: a sign of life, a look at the drives, a step of a stop, the program's pulse.
+        """Take a turn: send a sign of life, look at the drives, advance a stop, check whether the program stalls.
 
         Raises:
-            BusError: If the bus failed in one of them; the others are done all the same.
+            BusError: If the bus failed in one of them; the others are done in any case.
         """
         if not self._has_seen_all:
             if not self._stalls(time.monotonic() - self._alive):
@@ -346,7 +346,7 @@ class Watch:
                 self._stops.step()
 
     def _stalls(self, pause: float) -> bool:
-        """Return whether the program has made no call for longer than its limit; never without one."""
+        """Return whether the program has made no call for longer than the `stall` limit; False without that limit."""
         return self._limits.user.stall is not None and pause > self._limits.user.stall
 
     def _fail(self) -> None:
@@ -360,7 +360,7 @@ class Watch:
         )
 
     def _look(self) -> None:
-        """See to it that the newest sample is young."""
+        """Refresh the samples if the newest is too old."""
         now = time.monotonic()
         live = bool(self._axes.may_turn.any())
         if live:
@@ -376,7 +376,7 @@ class Watch:
             self._missed += 1
 
     def _look_after(self) -> None:
-        """Stop axes that cannot be seen or lost their state, and those of a program that stalls."""
+        """Stop axes that cannot be seen or whose node has restarted, and all axes if the program stalls."""
         now = time.monotonic()
         live = self._stops.judged()
         if not live.any():
@@ -400,7 +400,7 @@ class Watch:
                 "is another master there?",
             )
         if rival := self._watchdogs.take_rival():
-            self._axes.is_armed = False  # the watchdogs are set anew once the program enables
+            self._axes.is_armed = False  # the watchdogs are set anew when the program enables the next time
             self._stops.stop_for(rival, "end one of them")
         pause = now - self._alive
         if self._stalls(pause):

@@ -1,4 +1,4 @@
-"""The watchdogs of some drives: set, proved to be in force, and given up where the axes are proved off."""
+"""The watchdogs of some drives: set, verified, and given up once the axes are proved off."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-LEAST_SILENCE = 0.06  # s; what a computer that does other things besides can keep
-OF_TRAVEL = 0.25  # of the travel, that a dead master may use up
-ROUNDING = 0.001  # s by which a drive may act later than asked: watchdogs count milliseconds
+LEAST_SILENCE = 0.06  # s; the shortest silence that a computer with other work can keep
+OF_TRAVEL = 0.25  # of the travel, which an axis may use up after the master has died
+ROUNDING = 0.001  # s by which a drive may react late: watchdogs count milliseconds
 
 
 class Watchdogs:
@@ -35,9 +35,9 @@ class Watchdogs:
 
     Args:
         drives: The drives.
-        axes: What is known of them.
-        limits: Those that hold.
-        lending: What the drives have for a while, and get back before their watchdogs are given up.
+        axes: Their present state.
+        limits: The limits in force.
+        lending: The lent values, which the drives give back before their watchdogs are given up.
     """
 
     def __init__(self, drives: WatchedDrives, axes: Axes, limits: LimitsInForce, lending: Lending) -> None:
@@ -51,7 +51,7 @@ class Watchdogs:
         self._is_lockstep_proved = False
 
     def check(self) -> None:
-        """Have the axes armed anew unless every drive, asked, still watches over its master: one may have restarted.
+        """Require arming anew if a drive, asked, no longer watches its master: it may have restarted.
 
         Raises:
             BusError: If a node does not answer.
@@ -63,7 +63,7 @@ class Watchdogs:
                 self._axes.is_armed = False
 
     def check_not_held(self, entry: Entry) -> None:
-        """Raise SafetyError for an object that a watchdog depends on: it is never changed while it is set."""
+        """Raise SafetyError for an object that a watchdog depends on: it must not change while the watchdog is set."""
         if self._watch.holds((entry.index, entry.sub)):
             raise SafetyError(
                 f"{entry.label} belongs to the watchdog by which the drive notices that this process is dead; nothing "
@@ -71,32 +71,32 @@ class Watchdogs:
             )
 
     def keep(self) -> None:
-        """Have the drives hear that this process lives, when it is due."""
+        """Send a sign of life to the drives, when it is due."""
         self._watch.keep()
 
     def cease(self) -> None:
-        """Have the drives hear this process for the last time, so that they stop by themselves."""
+        """Send the drives a last sign of life, so that they stop by themselves."""
         with logged():
             self._watch.cease()
 
     def end(self) -> None:
-        """Have the drives hear nothing any more, since the watchdogs are given up."""
+        """Send the drives no more signs of life, since the watchdogs are given up."""
         self._watch.end()
         self._is_set = False
 
     def forget(self, node: int) -> None:
-        """Note that a node, by position, was reset: its watchdog is its own again."""
+        """Note that a node, by position, was reset: its watchdog has its own settings again."""
         self._watch.forget(node)
 
     def take_rival(self) -> str:
-        """Return, once, which other program keeps the drives from noticing this one's death; "" if none does."""
+        """Return, once, the program that keeps the drives from noticing this one's death; "" if there is none."""
         return self._watch.take_rival()
 
     def set(self) -> None:
-        """Have every drive watch over its master, and begin to be heard; in lockstep, prove that time waits.
+        """Set every drive's watchdog and begin to send signs of life; in lockstep, prove that time waits.
 
         Raises:
-            SafetyError: If a drive cannot watch, or not as soon as it must, or time does not wait.
+            SafetyError: If a drive has no watchdog, or one that is too slow, or time does not wait.
         """
         if self._drives.time_waits:
             self._prove_lockstep()
@@ -118,10 +118,10 @@ class Watchdogs:
             )
 
     def _silence(self) -> float:
-        """Return after which silence the drives act [s]: a dead master must not leave the travel.
+        """Return the silence after which the drives act [s]: after the master's death an axis must stay in its travel.
 
-        A drive that holds software limits itself keeps its travel; of another the speed allowed is lowered where even
-        the shortest silence would be too long.
+        A drive with software limits stays in its travel by itself; for another the allowed speed is lowered if even the
+        shortest silence would be too long.
         """
         silence = self._limits.user.silence
         assert silence is not None
@@ -171,7 +171,7 @@ class Watchdogs:
         self._is_lockstep_proved = True
 
     def give_up(self) -> None:
-        """Give drives their settings and watchdogs back; those that are not proved off keep them, and hear no more."""
+        """Restore the drives' settings and watchdogs; drives not proved off keep them and get no more signs of life."""
         per_node, heard = self._drives.description.num_axes, self._drives.link.wording.sign_of_life
         for k, node in enumerate(self._drives.nodes):
             axes = range(k * per_node, (k + 1) * per_node)
@@ -186,7 +186,7 @@ class Watchdogs:
                 self._axes.take_for_off(self._axes.of_nodes([k]))
                 continue
             self._axes.lost.update(axes)
-            self.cease()  # again, if need be: for the proof the node was started, and would wait for no heartbeat
+            self.cease()  # again, if need be: if the proof has started the node, it waits for no heartbeat
             logger.error(
                 "node %d could not be proved to be off: %s. Look at the machine, and keep the emergency stop at hand",
                 node,
@@ -196,9 +196,9 @@ class Watchdogs:
             )
 
     def _is_proved_off(self, axis: int) -> bool:
-        """Return whether the statusword, read twice in a row, shows an axis off: one answer may be an old one.
+        """Return whether the statusword, read twice in a row, shows an axis off: a single answer may be an old one.
 
-        Off is what no single frame enables; an axis that is closer to operation is taken there first.
+        "Off" is a state that no single frame enables; an axis in a state closer to operation is taken there first.
         """
         entry = self._known.find(STATUSWORD)
         off, is_woken = 0, False
@@ -213,8 +213,8 @@ class Watchdogs:
             except (BusError, ObjectAccessError):
                 if is_woken:
                     return False
-                # A node that has missed its master is stopped and answers nothing. Operational, not pre-operational,
-                # where some drives no longer watch their master.
+                # A node that has missed its master is stopped and does not answer. It is made operational, not
+                # pre-operational, since some drives do not watch their master in pre-operational.
                 is_woken = True
                 with logged():
                     self._drives.must_start()

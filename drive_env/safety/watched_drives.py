@@ -1,4 +1,4 @@
-"""What the envelope asks of the drives that it watches over, and what their cycles ask of it."""
+"""Protocols: what the envelope needs of the drives that it watches, and what their cycles need of the envelope."""
 
 from __future__ import annotations
 
@@ -16,43 +16,43 @@ if TYPE_CHECKING:
 
 
 class CycleWatch(Protocol):
-    """Who is asked before rows are played, and looks at what comes back in every cycle."""
+    """The envelope as seen by cycles: asked before rows are played, and given the samples of every cycle."""
 
     @property
     def epoch(self) -> int:
-        """What samples are asked for in: it grows with every controlword."""
+        """Return the epoch in which samples are requested: it grows with every controlword."""
 
     def watched(self) -> list[Entry]:
-        """Return the objects to sample at every SYNC, the most important first; the same while the limits stay."""
+        """Return the objects to sample at every SYNC, most important first; the same list until the limits change."""
 
     def sampled(self, chosen: Sequence[Entry]) -> None:
-        """Take note of what comes with every SYNC."""
+        """Note the objects that come with every SYNC."""
 
     def observe(
         self, rows: Mapping[Key, Integers], epoch: int, where: Mask | None = None, coming: int | None = None
     ) -> None:
-        """Look at samples, each object of shape (rows, num_axes)."""
+        """Check samples, each object of shape (rows, num_axes)."""
 
     def before_play(self, played: Mapping[Entry, Integers]) -> None:
         """Raise SafetyError for rows that would pass a limit."""
 
     def after_play(self, played: Mapping[Entry, Integers]) -> None:
-        """Take note of what was played."""
+        """Note played rows."""
 
     def after_failed_play(self, played: Mapping[Entry, Integers]) -> None:
-        """Take note that the drives may have taken any of the rows."""
+        """Note that the drives may have executed any of the rows."""
 
 
 class WatchedDrives(Protocol):
-    """Drives on a link, past the envelope: what is read and written here is neither checked nor watched."""
+    """Drives on a link, below the envelope: reads and writes here are neither checked nor watched."""
 
     @property
     def description(self) -> Description:
-        """What is known of the device."""
+        """The device's description."""
 
     @property
     def device(self) -> Device | None:
-        """What the drives are; None where only their EDS is known."""
+        """The device; None if only its EDS is known."""
 
     @property
     def nodes(self) -> tuple[int, ...]:
@@ -84,19 +84,19 @@ class WatchedDrives(Protocol):
         """Read an object of one axis, as the program sees it."""
 
     def read_raw(self, entry: Entry, axis: int) -> Any:
-        """Read an object of one axis as the drive has it, also where that is lent."""
+        """Read an object of one axis as the drive has it, even if that value is lent."""
 
     def write_raw(self, entry: Entry, axis: int, value: int) -> None:
-        """Write an object of one axis, past what is lent to it."""
+        """Write an object of one axis, regardless of a lent value."""
 
     def start(self) -> None:
-        """Take the nodes to where they exchange process data, once."""
+        """Make the nodes operational, so that they exchange process data; once."""
 
     def must_start(self) -> None:
-        """Take note that a node is not operational any more: the next command starts it."""
+        """Note that a node is not operational any more: the next command starts it."""
 
     def forget(self, nodes: Sequence[int]) -> None:
-        """Forget what nodes, by position, were configured to: they have restarted."""
+        """Forget the configuration of nodes, by position: they have restarted."""
 
     def pass_cycle(self) -> None:
         """Let one cycle pass."""
@@ -105,7 +105,7 @@ class WatchedDrives(Protocol):
         """Return the objects that come with every SYNC."""
 
     def prepare_watch(self, watch: CycleWatch) -> None:
-        """Have mapped what is watched."""
+        """Have the watched objects mapped to PDOs."""
 
     def poll(self, watch: CycleWatch) -> bool | None:
-        """Look at the drives by a SYNC of one's own: True if all answered, None where nothing is mapped."""
+        """Send a SYNC and observe its samples. False if a node sent none, None if cycles are under way."""

@@ -1,1 +1,1 @@
-"""Compiled code: how our kernels are compiled, kept and called. Whatever of Numba is private is touched here alone."""
+"""Compiled code: compiling, storing and calling our kernels. Only this package uses private parts of Numba."""

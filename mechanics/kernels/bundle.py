@@ -1,8 +1,8 @@
 """Many arrays and numbers as one argument of compiled code: a bundle.
 
-Numba takes a tuple of arrays apart at every call from Python (0.2 to 0.5 us per array) and passes it on as hundreds of
+Numba unpacks a tuple of arrays at every call from Python (0.2 to 0.5 us per array) and passes it on as hundreds of
 arguments to every function, each of which is compiled with them. A bundle is a table in memory with the address and
-shape of each array; what is passed is the table's address. Compiled code reads fields of a bundle as Python does.
+shape of each array; only the table's address is passed. Compiled code reads fields of a bundle as Python does.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _SCALARS: dict[Any, types.Type] = {int: types.int64, float: types.float64, bool:
 class Bundle:
     """Base of bundles: dataclasses whose fields are arrays of the kinds above, numbers and bundles.
 
-    The arrays' places and the numbers are those of its making, or of the last `replace`.
+    The arrays' addresses and the numbers are those at its creation, or at the last `replace`.
     """
 
     def __post_init__(self) -> None:
@@ -58,7 +58,7 @@ class Bundle:
         return type(self)
 
     def save_state(self) -> dict[str, Any]:
-        """Return copies of what is in it but integers, which are addresses or fixed, and arrays that are read-only."""
+        """Return copies of its contents, except integers (addresses or fixed values) and read-only arrays."""
         found: dict[str, Any] = {}
         for name in fields_of(self._layout):
             value = getattr(self, name)
@@ -71,7 +71,7 @@ class Bundle:
         return found
 
     def restore_state(self, state: Mapping[str, Any]) -> None:
-        """Bring back what `save_state` returned, into the arrays that are there where they are as large."""
+        """Restore a result of `save_state`, in place for arrays of equal size."""
         changed = {}
         for name, value in state.items():
             own = getattr(self, name)
@@ -128,7 +128,7 @@ def fields_of(layout: Any) -> dict[str, types.Type]:
 
 @cache
 def slots_of(layout: Any) -> tuple[tuple[str, int, types.Type, int, int], ...]:
-    """Return of each field its name, first slot in the table, type, and of an array its dimensions and item size."""
+    """Return each field's name, first slot in the table and type, and an array's dimensions and item size."""
     return tuple(
         (name, place_of(layout, name), kind, kind.ndim, _item_size(kind))
         if isinstance(kind, types.Array)
@@ -209,7 +209,7 @@ def _get(context: Any, builder: Any, bundle: BundleType, value: Any, name: str) 
     def slot(number: int, of: Any) -> Any:
         pointer = builder.bitcast(value, of.as_pointer())
         loaded = builder.load(builder.gep(pointer, [ir.Constant(whole, place + number)]), align=8)
-        # Nothing changes a table while compiled code runs: LLVM need not look again after a store.
+        # No table changes while compiled code runs: LLVM need not reload it after a store.
         loaded.set_metadata("invariant.load", builder.module.add_metadata([]))
         return loaded
 

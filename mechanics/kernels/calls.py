@@ -1,4 +1,4 @@
-"""What compiled code has no words for: to call by address, and to count among threads."""
+"""Operations that Numba lacks: calls by address, and a counter shared by threads."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def address_of_hook(function: Any) -> int:
 
 @intrinsic
 def call_hook(_context: Any, address: Any, bundle: Any, first: Any, count: Any) -> Any:
-    """Call what stands at an address; see `address_of_hook`."""
+    """Call the function at an address; see `address_of_hook`."""
 
     def generate(_target: Any, builder: Any, _signature: Any, args: Any) -> Any:
         whole = ir.IntType(64)
@@ -31,7 +31,7 @@ def call_hook(_context: Any, address: Any, bundle: Any, first: Any, count: Any) 
 
 @intrinsic
 def next_number(_context: Any, counter: Any) -> Any:
-    """Return the number in an array's first place and leave one more there: each thread gets another."""
+    """Return the first element of an array and increment it atomically, so that each thread gets another number."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         array = context.make_array(signature.args[0])(context, builder, args[0])

@@ -1,4 +1,4 @@
-"""How our Numba kernels are compiled and where their machine code is kept."""
+"""Compilation of our Numba kernels, and the storage of their machine code."""
 
 from __future__ import annotations
 
@@ -28,21 +28,21 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 OPTIONS: dict[str, Any] = {"error_model": "numpy", "nogil": True}
 
 _OURS = ("mechanics", "drive_env", "tuning", "agents")
-# At the beginning of a line: what a function or `if TYPE_CHECKING` imports is none that kernels see.
+# At the beginning of a line: imports in functions or under `if TYPE_CHECKING` are not used by kernels.
 _IMPORT = re.compile(r"^(?:from ([\w.]+) import (\([^)]*\)|.*)|import (.*))$", re.MULTILINE)
 
-# Without Numba's runtime no references to arrays are counted. To count those of a load's many arrays, atomically, at
-# each call of a stage took 0.2 to 1.3 us, half of what the emulator added to 64 steps of MuJoCo's.
+# Without Numba's runtime no references to arrays are counted. Atomic counting for a load's many arrays at each call of
+# a stage took 0.2 to 1.3 us, half of the emulator's overhead on 64 steps of MuJoCo.
 UNCOUNTED: dict[str, Any] = {"_nrt": False}
-# What kernels alone call needs no way in from Python or C: compiling those took a tenth of the whole.
+# Functions called only by kernels need no wrappers for Python or C: compiling those took a tenth of the time.
 UNWRAPPED: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
 
 class _QuickCompilation(event.Listener):  # type: ignore[misc]  # Numba has no types
-    """Has Numba remember its answers while it compiles, and Python's cyclic garbage collector wait.
+    """Caches Numba's repeated answers and pauses Python's cyclic garbage collector during a compilation.
 
-    A compilation makes millions of objects that live until its end: to look through them again and again took a sixth
-    of the whole. Numba compiles in one thread at a time.
+    A compilation makes millions of objects that live until its end: searching them repeatedly took a sixth of the time.
+    Numba compiles in one thread at a time.
     """
 
     def __init__(self) -> None:
@@ -58,7 +58,7 @@ class _QuickCompilation(event.Listener):  # type: ignore[misc]  # Numba has no t
         self._nested += 1
 
     def on_end(self, event: event.Event) -> None:
-        """Put everything back, whatever ended the compilation."""
+        """Restore everything, however the compilation ended."""
         self._nested -= 1
         if self._nested == 0:
             self._changed.close()
@@ -68,7 +68,7 @@ event.register("numba:compile", _QuickCompilation())
 
 
 def call_after_each_function(count: Callable[[], None]) -> None:
-    """Have a function called whenever Numba has compiled one."""
+    """Have a function called after Numba has compiled any function."""
 
     class Counter(event.Listener):  # type: ignore[misc]  # Numba has no types
         def on_start(self, _event: event.Event) -> None:
@@ -92,12 +92,12 @@ def user_cache_folder() -> Path:
 
 
 def sources(module: ModuleType) -> dict[str, Path]:
-    """Return the files of everything that a module's kernels may call or hold: its own, and of ours all it imports.
+    """Return the files that a module's kernels depend on: the module's file and all project files that it imports.
 
-    What it imports only where the types are checked is not loaded by it, and does not count.
+    Imports under TYPE_CHECKING are not loaded, and do not count.
 
     Args:
-        module: A module that is loaded, or whose imports are.
+        module: A loaded module, or one whose imports are loaded.
     """
     found: dict[str, Path] = {}
     waiting = [module]
@@ -113,7 +113,7 @@ def sources(module: ModuleType) -> dict[str, Path]:
 
 @cache
 def _imports(path: Path) -> frozenset[str]:
-    """Return what of ours a file imports when it is loaded; of `from a import b` both a and a.b, which may be none."""
+    """Return the project modules that a file imports when it is loaded; for `from a import b` both a and a.b."""
     names: set[str] = set()
     for line in _IMPORT.finditer(path.read_text(encoding="utf-8")):
         package, parts, plain = line.groups()
@@ -123,10 +123,10 @@ def _imports(path: Path) -> frozenset[str]:
 
 
 def source_hash(files: Mapping[str, Path]) -> str:
-    """Return a hash of the names and contents of modules and of Numba's version; where they lie does not matter.
+    """Return a hash of the names and contents of modules and of Numba's version; independent of their folder.
 
-    Numba's own cache looks at the file of the outermost function only, so an edit in a stage that is inlined from
-    another file would go unseen; a folder per state of the sources cannot miss one.
+    Numba's own cache checks only the file of the outermost function, and would miss an edit in a stage inlined from
+    another file; a folder per state of the sources cannot.
     """
     digest = hashlib.sha256(numba.__version__.encode())
     for name, path in sorted(files.items()):
@@ -138,8 +138,8 @@ def cached(*, allocates: bool = True, source: str | None = None) -> Callable[[Fu
     """Return a decorator that compiles an entry point and keeps its machine code on disk, keyed by its sources.
 
     Args:
-        allocates: Whether it makes arrays; if not, it counts no references, see `stage`.
-        source: Name of the module that tells what it is composed of, if not that in which it is written.
+        allocates: Whether it creates arrays; if not, it counts no references, see `stage`.
+        source: Name of the module whose sources it depends on, if not its own.
     """
     options = OPTIONS if allocates else OPTIONS | UNCOUNTED
 
@@ -154,8 +154,8 @@ def cached(*, allocates: bool = True, source: str | None = None) -> Callable[[Fu
         before = config.CACHE_DIR
         config.CACHE_DIR = str(folder)
         try:
-            kernel._cache = KernelCache(function, folder, stamp)  # what cache=True does, with files that can be trusted
-        except RuntimeError:  # Numba finds no folder that can be written
+            kernel._cache = KernelCache(function, folder, stamp)  # as cache=True does, but with verified files
+        except RuntimeError:  # Numba finds no writable folder
             return kernel  # type: ignore[no-any-return]
         finally:
             config.CACHE_DIR = before
@@ -165,12 +165,12 @@ def cached(*, allocates: bool = True, source: str | None = None) -> Callable[[Fu
 
 
 def stage(function: Function) -> Function:
-    """Compile a function that kernels call, and they alone. It cannot make arrays."""
+    """Compile a function that only kernels call. It cannot create arrays."""
     kernel: Any = njit(**OPTIONS, **UNCOUNTED, **UNWRAPPED, pipeline_class=StageCompiler)(function)
     specialised = kernel.get_call_template
 
-    # Numba would compile it once more for each number that a caller has written out: the automaton's transitions seven
-    # times. The optimiser sees the number all the same, where it puts the function in its caller's place.
+    # Numba would compile it once more for each constant argument: the automaton's transitions seven times. The
+    # optimiser still sees the constant when it inlines the function.
     def of_any_number(args: Any, kws: Any) -> Any:
         return specialised(
             tuple(types.unliteral(one) for one in args), {name: types.unliteral(one) for name, one in kws.items()}
@@ -181,5 +181,5 @@ def stage(function: Function) -> Function:
 
 
 def inlined(function: Function) -> Function:
-    """Compile a function whose body is put in place of each call; what a vectorised lane loop calls must be one."""
+    """Compile a function that is inlined at each call, as all functions in a vectorised lane loop must be."""
     return njit(inline="always", **OPTIONS)(function)  # type: ignore[no-any-return]

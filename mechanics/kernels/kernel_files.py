@@ -1,9 +1,9 @@
-"""Compiled kernels on disk: a file is taken only if it is whole, and each kernel has a file of its own.
+"""Compiled kernels on disk: a file is used only if it is complete, and each kernel has its own file.
 
-Numba's own cache unpickles whatever its files hold: one torn by a kill, a full disk or a power cut ends every program
-with an UnpicklingError until somebody removes it, and one with another byte in its machine code does anything at all.
-Its index numbers the kernels of a function, so that two processes may give one number to two signatures, and one then
-runs the other's machine code. Here a file holds one kernel behind its hash, and is named after all that it depends on.
+Numba's own cache unpickles any file: one truncated by a kill, a full disk or a power cut ends every program with an
+UnpicklingError until it is removed, and a changed byte in machine code has arbitrary effects. Its index numbers the
+kernels of a function, so two processes may give one number to two signatures, and one then runs the other's machine
+code. Here a file holds one kernel after its hash, and is named after everything that it depends on.
 """
 
 from __future__ import annotations
@@ -27,50 +27,50 @@ logger = logging.getLogger(__name__)
 
 _DIGEST = hashlib.sha256().digest_size
 
-# What is logged of each kernel that is not there, with its name, before and after it is compiled; at level DEBUG.
+# Log texts of a missing kernel, with its name, before and after it is compiled; at level DEBUG.
 COMPILING, COMPILED = "compiling the kernel %s", "compiled the kernel %s"
 
 
 class KernelCache(FunctionCache):  # type: ignore[misc]  # Numba has no types
-    """Numba's cache of a function's kernels, with files of ours.
+    """Numba's cache of a function's kernels, with our files.
 
     Args:
-        function: What is compiled.
-        folder: Where its kernels are; it exists.
-        stamp: Of all sources that it is compiled from.
+        function: The function.
+        folder: Existing folder of its kernels.
+        stamp: Hash of all sources that it depends on.
     """
 
     def __init__(self, function: Any, folder: Path, stamp: str) -> None:
         super().__init__(function)
         self._cache_path = str(folder)
-        # Without the function that composes it: its name is the module's and its own.
+        # Without the composing function: the name is that of the module and its own.
         name = re.sub(r"\w+\.locals\.", "", self._impl.filename_base)
         self._cache_file = KernelFiles(folder, name, stamp)
 
     def _index_key(self, signature: Any, codegen: Any) -> Any:
-        # What a composed kernel closes over are stages, whose pickles are others in each process; the stamp knows them.
+        # A composed kernel's closure contains stages, whose pickles differ between processes; the stamp covers them.
         return signature, codegen.magic_tuple(), hashlib.sha256(self._py_func.__code__.co_code).hexdigest()
 
     def _save_overload(self, signature: Any, kernel: Any) -> None:
-        # Numba's own makes a folder besides, named after where the source lies.
+        # Numba's own class would make a folder named after the source's path.
         if self._enabled and self._impl.check_cachable(kernel):
             self._cache_file.save(self._index_key(signature, kernel.codegen), self._impl.reduce(kernel))
 
 
 class KernelFiles:
-    """The kernels of one function, by what each depends on; it is what Numba asks for one and gives one to.
+    """The kernels of one function, by their dependencies; Numba loads and saves through it.
 
     Args:
-        folder: Where they are; it exists.
-        name: Of the function, with place and Python version.
-        stamp: Of the function's sources.
+        folder: Their existing folder.
+        name: Name of the function, with module and Python version.
+        stamp: Hash of the function's sources.
     """
 
     def __init__(self, folder: Path, name: str, stamp: Any) -> None:
         self._folder, self._name, self._stamp = folder, name, stamp
 
     def load(self, key: Any) -> Any:
-        """Return what was saved under a key; None if nothing was, or if its file is not whole any more."""
+        """Return the kernel saved under a key; None if there is none, or its file is damaged."""
         path = self._path(key)
         try:
             content = path.read_bytes()
@@ -78,7 +78,7 @@ class KernelFiles:
             return self._missing()
         digest, data = content[:_DIGEST], content[_DIGEST:]
         if hashlib.sha256(data).digest() == digest:
-            with suppress(Exception):  # whole and ours, but perhaps of another version of what Numba stands on
+            with suppress(Exception):  # complete and ours, but perhaps of another version of a package that Numba uses
                 found, kernel = pickle.loads(data)
                 if found == self._identity(key):
                     return kernel
@@ -87,7 +87,7 @@ class KernelFiles:
         return self._missing()
 
     def save(self, key: Any, kernel: Any) -> None:
-        """Keep a kernel; where that is impossible (disk full, folder gone), say so once and go on without."""
+        """Save a kernel; if that is impossible (disk full, folder gone), warn once and continue without."""
         logger.debug(COMPILED, self._name)
         data = dumps((self._identity(key), kernel))
         path = self._path(key)
@@ -96,12 +96,12 @@ class KernelFiles:
             beside.write_bytes(hashlib.sha256(data).digest() + data)
             beside.replace(path)
         except OSError as error:
-            if not (os.name == "nt" and error.errno == errno.EACCES):  # another process reads the same kernel there
+            if not (os.name == "nt" and error.errno == errno.EACCES):  # another process is reading the same kernel
                 _tell_not_kept(str(self._folder), error.strerror)
             _remove(beside)
 
     def flush(self) -> None:
-        """Forget what was kept."""
+        """Forget the saved kernels."""
         for path in self._folder.glob(f"{self._name}.*.kernel"):
             _remove(path)
 
@@ -110,7 +110,7 @@ class KernelFiles:
         logger.debug(COMPILING, self._name)
 
     def _identity(self, key: Any) -> str:
-        """Return all that a kernel depends on besides the sources in the folder's name, as text."""
+        """Return a kernel's dependencies as text, except the sources, which are in the folder's name."""
         return repr((self._stamp, key))
 
     def _path(self, key: Any) -> Path:

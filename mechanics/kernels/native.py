@@ -1,4 +1,4 @@
-"""MuJoCo's step and its parts, as compiled code calls them."""
+"""MuJoCo's step and its parts, for calls from compiled code."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def _load_mujoco() -> None:
 _load_mujoco()
 _call = types.void(types.uintp, types.uintp)
 step = types.ExternalFunction("mj_step", _call)
-# The two halves of mj_step: what follows from positions and speeds, then from forces. The first is 80 % of the whole.
+# The two halves of mj_step: from positions and speeds, then from forces. The first takes 80 % of the time.
 step1 = types.ExternalFunction("mj_step1", _call)
 step2 = types.ExternalFunction("mj_step2", _call)
 factor = types.ExternalFunction("mj_factorM", _call)

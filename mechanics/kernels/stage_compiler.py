@@ -1,4 +1,4 @@
-"""What Numba is spared while it compiles kernels: machine code of stages, and questions that it has answered before.
+"""Faster compilation of kernels: no machine code for single stages, and cached answers inside Numba.
 
 Together they take two fifths off a cold start. They stand on private parts of Numba;
 `tests/machines/test_stage_compiler.py` fails where a version has these no more.
@@ -18,7 +18,7 @@ from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import register_pass
 from numba.core.typed_passes import NativeLowering
 
-# What these types make of an operator depends on nothing else.
+# The operators of these types depend on nothing else.
 _PLAIN = (types.Number, types.Boolean, types.Buffer, types.Record)
 
 
@@ -26,7 +26,7 @@ class _StageLibrary(JITCodeLibrary):  # type: ignore[misc]  # Numba has no types
     """A stage as LLVM's intermediate code: the kernel that it is linked into is optimised and compiled as a whole."""
 
     def finalize(self) -> None:
-        """Link what the stage calls, and leave the rest to the kernel."""
+        """Link the functions that the stage calls, and leave the rest to the kernel."""
         for library in dict.fromkeys(self._linking_libraries):
             self._reload_init.update(library._reload_init)
             self._final_module.link_in(library._get_module_for_linking(), preserve=True)
@@ -40,7 +40,7 @@ class _StageLowering(NativeLowering):  # type: ignore[misc]
     _name = "stage_lowering"
 
     def run_pass(self, state: Any) -> bool:
-        """Lower a stage. What Python would call raises."""
+        """Lower a stage. A wrapper for Python would raise."""
         state.library = _StageLibrary(state.targetctx.codegen(), state.func_id.func_qualname)
         state.flags.no_compile = True
         super().run_pass(state)
@@ -51,10 +51,10 @@ class _StageLowering(NativeLowering):  # type: ignore[misc]
 
 
 class StageCompiler(CompilerBase):  # type: ignore[misc]
-    """Compiles a function that kernels alone call to intermediate code."""
+    """Compiles a function that only kernels call to intermediate code."""
 
     def define_pipelines(self) -> list[Any]:
-        """Return Numba's own passes, with another lowering."""
+        """Return Numba's own passes, with the lowering replaced."""
         passes = DefaultPassBuilder.define_nopython_pipeline(self.state)
         passes.passes = [(_StageLowering if one is NativeLowering else one, told) for one, told in passes.passes]
         passes._finalized = False
@@ -64,11 +64,11 @@ class StageCompiler(CompilerBase):  # type: ignore[misc]
 
 @contextmanager
 def remembered_answers() -> Iterator[None]:
-    """Have Numba remember what does not change while it compiles a kernel.
+    """Make Numba cache unchanging answers while it compiles a kernel.
 
-    It looks for the implementation of each operator among dozens at each place and each round of type inference (a
-    fifth of the time), writes a record's 400 fields out to name it in events and errors without a reader (a twelfth),
-    and copies all variables of a function with each block that it puts in a caller's place (an eighth).
+    Otherwise it searches each operator's implementation among dozens at each use and each round of type inference (a
+    fifth of the time), formats a record's 400 fields for unread events and errors (a twelfth), and copies all variables
+    of a function with each inlined block (an eighth).
     """
     with ExitStack() as changed:
         for owner, name, other in (
@@ -82,7 +82,7 @@ def remembered_answers() -> Iterator[None]:
 
 
 def _remember_texts(write: Callable[[Any], str]) -> Callable[[Any], str]:
-    known: dict[int, tuple[Any, str]] = {}  # with the record, so that its id stays its own
+    known: dict[int, tuple[Any, str]] = {}  # with the record, so that its id is not reused
 
     def text(record: Any) -> str:
         if id(record) not in known:
@@ -111,14 +111,14 @@ def _remember_operators(find: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class _BlockCopies:
-    """Python's `copy`, for which the blocks of one function share their copied variables."""
+    """Replaces Python's `copy` so that the blocks of one function share their copied variables."""
 
     def __init__(self) -> None:
         self._scope: Any = None
         self._memo: dict[int, Any] = {}
 
     def deepcopy(self, one: Any) -> Any:
-        """Copy; a block that comes again belongs to another copy of its function."""
+        """Copy; a block that is copied again belongs to another copy of its function."""
         if not isinstance(one, ir.Block):
             return copy.deepcopy(one)
         if one.scope is not self._scope or id(one) in self._memo:

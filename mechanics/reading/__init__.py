@@ -1,1 +1,1 @@
-"""Files that anybody may have written: readers with limits, a process with limits, and names that were meant."""
+"""Untrusted files: readers with limits, a process with limits, and suggestions for unknown names."""

@@ -1,8 +1,8 @@
-"""A call in a process of its own, with limits of memory and time: for libraries that take what a file asks for.
+"""A call in a separate process with limits of memory and time: for libraries without limits of their own.
 
-MuJoCo, onnxruntime and readers of logs have no limits of their own: a short file may ask for 10^9 bodies, 10^12 numbers
-or an end that never comes. Here that process ends, and the program that asked goes on. It limits accidents and malice
-by size; it is no sandbox, and a fault in such a library runs with the user's rights.
+MuJoCo, onnxruntime and readers of logs have no limits: a short file may demand 10^9 bodies, 10^12 numbers or an endless
+loop. Here the separate process ends, and the calling program continues. This limits the size of accidents and attacks,
+but is not a sandbox: an exploited library has the user's rights.
 """
 
 from __future__ import annotations
@@ -25,23 +25,23 @@ try:
 except ImportError:  # Windows: the time alone is limited there
     resource = None  # type: ignore[assignment]
 
-MEMORY = 4_000_000_000  # bytes that a call may take more than its libraries do
+MEMORY = 4_000_000_000  # bytes that a call may use in addition to its libraries
 TIME = 60.0  # s of the processor
-WAITING = 3.0  # times as long by the clock: other programs take the processor, too
-_FOUND, _REFUSED, _MEMORY = b"+", b"-", b"m"  # what the answer of a process begins with
+WAITING = 3.0  # times as long by the clock: other programs use the processor, too
+_FOUND, _REFUSED, _MEMORY = b"+", b"-", b"m"  # first byte of a process' answer
 
 
 def call_limited(
     what: str, function: Callable[..., bytes], *arguments: Any, memory: int | None = None, time: float | None = None
 ) -> bytes:
-    """Return what a function makes of its arguments, in a process that may not take more than the limits.
+    """Return a function's result, computed in a process with limits.
 
     Args:
-        what: What is read, for the message.
-        function: Of a module; it returns bytes, and raises ValueError with what is wrong with the file.
-        arguments: What it takes; they must pickle.
-        memory: Bytes that it may take, where the system limits them (Linux); MEMORY by default.
-        time: Of the processor [s], TIME by default; by the clock three times as long.
+        what: Name of the file, for the message.
+        function: A module's function that returns bytes, or raises ValueError about the file.
+        arguments: Its arguments, which must be picklable.
+        memory: Limit in bytes, if the system supports it (Linux); MEMORY by default.
+        time: Processor time [s], TIME by default; by the clock three times as long.
 
     Raises:
         ValueError: As the function.
@@ -72,10 +72,10 @@ def call_limited(
 
 
 def answer() -> None:
-    """Make the call that stands on the standard input, and write its result to the standard output."""
+    """Run the call read from standard input, and write its result to standard output."""
     module, name, arguments, memory, time = pickle.load(sys.stdin.buffer)
     out = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # what a library prints is no answer
+    os.dup2(2, 1)  # output of a library is not part of the answer
     function = getattr(import_module(module), name)
     _limit(memory, time)
     try:

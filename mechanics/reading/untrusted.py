@@ -1,7 +1,7 @@
-"""Files that anybody may have written: read within limits of size, depth and kind, and without running what is in them.
+"""Untrusted files: read within limits of size, depth and type, without executing their content.
 
-A file that passes a limit is refused before memory is taken for it. All errors are ValueErrors of one line; what a file
-means is its reader's matter.
+A file beyond a limit is refused before memory is allocated for it. All errors are ValueErrors of one line; the meaning
+of a file is left to its reader.
 """
 
 from __future__ import annotations
@@ -27,20 +27,19 @@ from xml.parsers import expat
 import numpy as np
 from numpy.typing import NDArray
 
-MOST_TEXT = 16_000_000  # bytes of a JSON, YAML, EDS or MJCF: the largest that we write has some 100 kB
+MOST_TEXT = 16_000_000  # bytes of a JSON, YAML, EDS or MJCF: the largest of our own has some 100 kB
 MOST_TOML = 4_000_000  # bytes; tomllib reads about 1 MB/s
 MOST_RECORDING = 500_000_000  # bytes of a log of frames or samples: an hour of a full bus has some 300 MB
 MOST_LINE = 1_000_000  # letters of a line of a CSV
 MOST_ARRAYS = 500_000_000  # bytes of the arrays in an .npz, unpacked
 MOST_ENTRIES = 10_000  # arrays in an .npz
-DEEPEST = 40  # tables and lists in one another
+DEEPEST = 40  # nested tables and lists
 MOST_VALUES = 1_000_000  # in a table, each mention of a YAML alias counted
 MOST_ELEMENTS = 500_000  # of an XML: the ESI of a maker's whole series has some 300,000
 MOST_TOML_VALUES = 200_000  # and parts of keys: each part of a dotted key is a table
 
-# What tomllib takes no heed of is looked for before it begins: its memory grows with the square of a key's parts. Each
-# pattern goes through a text once, whatever is in it: what it has taken it never gives back, and a string that does not
-# end ends with the text.
+# Cases that tomllib does not limit are checked before: its memory grows with the square of a key's parts. Each pattern
+# passes any text only once: it never backtracks, and a string without an end extends to the end of the text.
 _TOML_STRINGS = re.compile(
     r'''"""(?:[^"\\]++|\\(?:.|\Z)|"(?!""))*+(?:"{3,5}|\Z)'''
     r"""|'''(?:[^']++|'(?!''))*+(?:'{3,5}|\Z)"""
@@ -53,25 +52,25 @@ _BRACKET = re.compile(r"[\[\]{}]")
 
 _CONTAINERS = (Mapping, list, tuple)
 
-# What zip, zlib and NumPy raise at a file that is damaged, or made to be: RuntimeError of an encrypted member,
-# NotImplementedError of a way of packing that is unknown, SyntaxError of an array's header.
+# Exceptions of zip, zlib and NumPy for a damaged or malicious file: RuntimeError for an encrypted member,
+# NotImplementedError for an unknown compression, SyntaxError for an array's header.
 _DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, KeyError, ValueError, TypeError, OverflowError, RuntimeError,
             NotImplementedError, SyntaxError, tokenize.TokenError,
             RecursionError, MemoryError, AttributeError, IndexError)  # fmt: skip
 
 
 class UntrustedFileError(ValueError):
-    """A file passes a limit, or holds what none of its kind does; the message says which."""
+    """A file exceeds a limit, or has impossible content for its type; the message says which."""
 
 
 class TooLargeError(UntrustedFileError):
-    """A file is larger than any of its kind, or would be once it is unpacked."""
+    """A file is larger than any of its type, or would be after unpacking."""
 
 
 def check_size(path: Path, most: int) -> None:
     """Raise UntrustedFileError for a file that is not regular or has more than `most` bytes, OSError for an absent one.
 
-    To open a pipe waits for whoever writes into it, and a device may have no end.
+    Opening a pipe waits for its writer, and a device may be endless.
     """
     found = path.stat()
     if not stat.S_ISREG(found.st_mode) and not stat.S_ISDIR(found.st_mode):  # opening a folder fails by itself
@@ -86,7 +85,7 @@ def read_bytes(path: str | Path, most: int = MOST_TEXT) -> bytes:
     """Return a file's bytes.
 
     Raises:
-        UntrustedFileError: If it has more than `most`, or is a pipe or a device.
+        UntrustedFileError: If it has more than `most` bytes, or is a pipe or a device.
         OSError: If it cannot be read.
     """
     check_size(Path(path), most)
@@ -105,7 +104,7 @@ def read_start(path: str | Path, count: int) -> bytes:
 
 
 def read_text(path: str | Path, most: int = MOST_TEXT) -> str:
-    """Return the text of a UTF-8 file with one end of lines; raises as `read_bytes`, and UnicodeDecodeError."""
+    """Return the text of a UTF-8 file with uniform line ends; raises as `read_bytes`, and UnicodeDecodeError."""
     return io.TextIOWrapper(io.BytesIO(read_bytes(path, most)), encoding="utf-8").read()
 
 
@@ -113,7 +112,8 @@ def read_toml(path: str | Path) -> dict[str, Any]:
     """Return the table in a TOML file.
 
     Raises:
-        tomllib.TOMLDecodeError: If it is none, or passes a limit; UnicodeDecodeError, OSError as reading a file does.
+        tomllib.TOMLDecodeError: If it is not TOML, or exceeds a limit; UnicodeDecodeError, OSError as reading a file
+            does.
     """
     try:
         return parse_toml(read_text(path, MOST_TOML))
@@ -131,7 +131,7 @@ def parse_toml(text: str) -> dict[str, Any]:
         raise
     except RecursionError:
         raise tomllib.TOMLDecodeError(_too_deep()) from None
-    except (ValueError, OverflowError) as error:  # a number of more digits than Python reads, or a limit of ours
+    except (ValueError, OverflowError) as error:  # a number with more digits than Python reads, or a limit of ours
         raise tomllib.TOMLDecodeError(str(error)) from None
     return table
 
@@ -139,15 +139,15 @@ def parse_toml(text: str) -> dict[str, Any]:
 def parse_json(text: str | bytes) -> Any:
     """Return the value in a text.
 
-    JSON has neither NaN nor Infinity, though Python's reader takes both. Of a name that stands twice in one table
-    Python's reader drops the first: what a person reads there would not be what a program reads.
+    JSON has neither NaN nor Infinity, although Python's reader accepts both. For a duplicate name in a table Python's
+    reader drops the first value, so a person might read another value than the program.
 
     Raises:
         ValueError: If it is not JSON, has NaN, a name twice in one table, or exceeds a limit.
     """
     try:
         text = text if isinstance(text, str) else text.decode("utf-8-sig")
-        if sum(map(text.count, ",[{")) > 2 * MOST_VALUES:  # values and containers, before there is memory for them
+        if sum(map(text.count, ",[{")) > 2 * MOST_VALUES:  # values and containers, before allocating memory
             raise UntrustedFileError(_too_many())
         value = json.loads(
             text, parse_constant=_no_constant, parse_float=_finite, object_pairs_hook=_table_of_different_names
@@ -205,7 +205,7 @@ def parse_xml(content: bytes) -> ET.Element:
 
 
 def read_rows(path: str | Path) -> Iterator[list[str]]:
-    """Give the rows of a CSV line by line.
+    """Yield the rows of a CSV line by line.
 
     Raises:
         UntrustedFileError: As `check_size`, and for a line of more than MOST_LINE letters.
@@ -223,9 +223,9 @@ def _short(path: str | Path, line: str) -> str:
 
 
 def check_table(value: Any) -> None:
-    """Raise UntrustedFileError for what nests deeper than DEEPEST or has more than MOST_VALUES values.
+    """Raise UntrustedFileError for a value nested deeper than DEEPEST, or with more than MOST_VALUES values.
 
-    A table mentioned many times counts each time (YAML's aliases): whoever walks through it meets it each time.
+    A table mentioned several times (YAML's aliases) counts each time, since a reader visits it each time.
     """
     level, count = [one for one in [value] if isinstance(one, _CONTAINERS)], 0
     for _ in range(DEEPEST):
@@ -245,11 +245,10 @@ def check_table(value: Any) -> None:
 def read_arrays(source: str | Path | BinaryIO, most: int = MOST_ARRAYS) -> dict[str, NDArray[Any]]:
     """Return the arrays of numbers and texts in an .npz; never objects, which would be pickles.
 
-    The directory of the file says how large its members are, and each member's header must say the same: a bomb is
-    refused before it is unpacked.
+    The sizes in the file's directory must equal those in each member's header: a bomb is refused before it is unpacked.
 
     Raises:
-        UntrustedFileError: If it is no .npz, is damaged, or holds more than `most` bytes.
+        UntrustedFileError: If it is not an .npz, is damaged, or holds more than `most` bytes.
         OSError: If it cannot be read.
     """
     name = source if isinstance(source, str | Path) else "the data"
@@ -275,8 +274,8 @@ def read_member(path: str | Path, name: str, most: int = MOST_TEXT) -> bytes:
     """Return a member of a .zip.
 
     Raises:
-        KeyError: If there is none of that name.
-        UntrustedFileError: If it is no .zip, is damaged, or the member has more than `most` bytes.
+        KeyError: If there is no such member.
+        UntrustedFileError: If it is not a .zip, is damaged, or the member has more than `most` bytes.
         OSError: If it cannot be read.
     """
     check_size(Path(path), sys.maxsize)
@@ -305,7 +304,7 @@ def member_names(path: str | Path) -> list[str]:
 
 
 def _unpacked(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
-    """Return a member's bytes, never more than the directory says, whatever was packed."""
+    """Return a member's bytes, at most as many as the directory says."""
     if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):  # others are unpacked without a limit
         raise ValueError(f"{member.filename} is packed in another way than .npz and .zip are")
     with archive.open(member) as stream:
@@ -332,10 +331,10 @@ def _one_line(error: BaseException) -> str:
 
 
 def _check_toml(text: str) -> None:
-    """Raise UntrustedFileError for what would take tomllib memory or time far beyond the length of the text."""
+    """Raise UntrustedFileError for text that would take tomllib memory or time far beyond its length."""
     if len(text) > MOST_TOML:
         raise TooLargeError(f"it has {len(text) / 1e6:.0f} MB, and {MOST_TOML / 1e6:.0f} MB of TOML are read")
-    bare = _TOML_STRINGS.sub('"', text)  # what stands in strings and comments nests nothing
+    bare = _TOML_STRINGS.sub('"', text)  # strings and comments nest nothing
     if _LONG_KEY.search(bare):
         raise UntrustedFileError(_too_deep())
     if sum(map(bare.count, ",=.[{")) > MOST_TOML_VALUES:
@@ -348,7 +347,7 @@ def _check_toml(text: str) -> None:
 
 
 def _table_of_different_names(pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
-    """Return the table of a JSON object; UntrustedFileError if a name stands in it twice."""
+    """Return the table of a JSON object; UntrustedFileError for a duplicate name."""
     pairs = list(pairs)
     table = dict(pairs)
     if len(table) < len(pairs):

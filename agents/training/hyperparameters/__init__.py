@@ -1,8 +1,8 @@
 """Hyper-parameters as YAML in RL-Zoo's form: a file per environment and algorithm, `<environment>_<algorithm>.yaml`.
 
-A section named after the environment holds what RL-Zoo would train with; sections `quick` and `full` replace entries of
-it for the presets. Strings like "dict(net_arch=[64, 64], activation_fn=nn.Tanh)" are read as RL-Zoo writes them, but
-without evaluating code.
+A section named after the environment holds RL-Zoo's hyper-parameters; sections `quick` and `full` replace entries of it
+for the presets. Strings like "dict(net_arch=[64, 64], activation_fn=nn.Tanh)" are read as in RL-Zoo, but without
+evaluating code.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from mechanics.reading.untrusted import check_table, read_text
 FOLDER = Path(__file__).parent
 PRESETS = ("quick", "full")
 
-# Keys that are the run's, as RL-Zoo has them; all others go to the algorithm's constructor.
-# `imitate`, the name of a baseline that the policy begins as, is ours.
+# Keys of the run, as in RL-Zoo; all others go to the algorithm's constructor. Our addition is `imitate`, the name of a
+# baseline that the policy first imitates.
 RUN_KEYS = ("n_envs", "n_timesteps", "policy", "normalize", "env_kwargs", "vec_env_wrapper", "imitate")
 
 
@@ -38,7 +38,7 @@ class HyperparameterError(ValueError):
 
 
 class _DifferentNames(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
-    """PyYAML's safe reader, which drops the first of a name that stands twice; this one refuses it."""
+    """PyYAML's safe reader, but a duplicate name is an error instead of replacing the first."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         names = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
@@ -58,7 +58,7 @@ def load(
         environment: The environment's name, or its last part in any spelling (gain_tuning, Tracking-v0).
         algorithm: One of ALGORITHMS.
         preset: One of PRESETS.
-        path: Another file than the one that ships.
+        path: File to use instead of the shipped one; None for the shipped one.
         section: A section of the file whose entries replace those of the preset, e.g. of a load.
 
     Raises:
@@ -82,7 +82,7 @@ def load(
         merge(found, {name: read_value(value) for name, value in (table.get(key) or {}).items()})
     if task in TASKS:
         found.pop("env_kwargs", None)  # the task has its own
-    if path is None:  # in a file of the user's it is a mistake
+    if path is None:  # in a user's file it is a mistake
         for key in NOT_TAKEN.get(algorithm, ()):
             found.pop(key, None)
     for key in ("n_envs", "n_timesteps", "policy"):
@@ -97,14 +97,14 @@ def load(
 
 
 def sections(environment: str, algorithm: str, path: str | Path | None = None) -> tuple[str, ...]:
-    """Return the sections of a file (the one that ships) that are of loads, not of the environment or a preset."""
+    """Return the sections of loads in a file (by default the shipped one), without environment and presets."""
     name = environment_of(environment_name(environment))
     table = _read(_file(name, algorithm, path))
     return tuple(key for key in table if key not in (name, *PRESETS) and "/" not in key)
 
 
 def merge(found: dict[str, Any], others: Mapping[str, Any]) -> None:
-    """Replace entries by others; a table's entries one by one."""
+    """Replace entries by others; the entries of tables are replaced one by one."""
     for key, value in others.items():
         if isinstance(value, Mapping) and isinstance(found.get(key), dict):
             merge(found[key], value)
@@ -149,13 +149,13 @@ def schedule(value: Any) -> Any:
 
 
 class Linear:
-    """A schedule that falls from `first` to 0."""
+    """A schedule that falls linearly from `first` to 0."""
 
     def __init__(self, first: float) -> None:
         self.first = first
 
     def __call__(self, remaining: float) -> float:
-        """Return the value when so much of the run is left, 1...0."""
+        """Return the value at the remaining share of the run, 1...0."""
         return self.first * remaining
 
 

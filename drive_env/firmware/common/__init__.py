@@ -1,1 +1,1 @@
-"""What all drives share: automaton, profiles, modes, inputs, protection; SI units throughout."""
+"""The parts that all drives share: automaton, profiles, modes, inputs, protection; SI units throughout."""

@@ -82,7 +82,7 @@ def between(x, low, high):
 
 @inlined
 def exponential(x):
-    """Return exp(x) to 1e-15 for -1 <= x <= 0; below, the series is applied to x/8 and squared three times."""
+    """Return exp(x) to 1e-15 for -1 <= x <= 0; below -1, the series is applied to x/8 and squared three times."""
     y = x * 0.125
     e = 1.0 + y * (
         1.0

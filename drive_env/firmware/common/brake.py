@@ -3,12 +3,12 @@
     transition 4     current flows, enable_delay, brake released, brake_release_delay, operation enabled
     an orderly stop  brake applied, brake_apply_delay, current off
 
-The output carries a current, one for each of both states; both 0 leave the brake to others. What takes the energy away
-(disable voltage, a quick stop of an axis that is not enabled, a cause that cuts the stage) does so at once, and the
-brake is applied in the same moment: no delay keeps current in a motor that must have none.
+The output has one current for each of the two states; if both are 0, the drive does not control the brake. Commands and
+causes that cut the energy (disable voltage, a quick stop of an axis that is not enabled, a cause that cuts the stage)
+act at once, and the brake is applied at the same time: no delay keeps current in a motor that must not have any.
 
-The brake is one that a spring closes. It opens some time after its current has reached the pull-in share of the
-output's largest, and closes some time after it has fallen below the drop-out share; between the two it stays.
+The brake is closed by a spring. It opens some time after its current has reached the pull-in share of the output's
+largest, and closes some time after it has fallen below the drop-out share; in between it keeps its state.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from __future__ import annotations
 from mechanics.kernels.compiled import stage
 
 LARGEST = 255.0  # of an output's current
-PULL_IN, DROP_OUT = 0.6, 0.2  # of the output's largest current; usual for brakes with a spring
+PULL_IN, DROP_OUT = 0.6, 0.2  # of the output's largest current; usual for spring-applied brakes
 OPEN, CLOSED, WITH_STAGE, WITH_OUTPUT = 0, 1, 2, 3  # modes of a machine's brake
 
 
 @stage
 def is_controlled(drive, lane):
-    """Return whether the drive moves its brake at all."""
+    """Return whether the drive controls a brake."""
     return drive.brake_apply_current[lane] > 0.0 or drive.brake_release_current[lane] > 0.0
 
 
@@ -43,14 +43,14 @@ def hold_until_closed(drive, lane):
 
 @stage
 def drive_output(drive, lane, dt):
-    """Give the output its current for one period of dt [s], end a hold that is over, and count both waits on."""
+    """Set the output's current for one period of dt [s], end an elapsed hold, and advance both delays."""
     enabling = drive.transition_pending[lane] == 4
     waited = drive.switching_time[lane] + 0.5 * dt
     if drive.holding[lane] == 1 and not enabling and waited > drive.brake_apply_delay[lane]:
         drive.holding[lane] = 0
     released = drive.drive_function[lane] > 0.0 or (enabling and waited > drive.enable_delay[lane])
     current = drive.brake_release_current[lane] if released else drive.brake_apply_current[lane]
-    # A drive whose supply has failed drives no output.
+    # A drive without supply drives no output.
     powered = drive.u_dc[lane] >= drive.undervoltage[lane]
     drive.brake_output[lane] = current / LARGEST if powered else 0.0
     drive.switching_time[lane] += dt

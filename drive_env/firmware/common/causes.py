@@ -1,6 +1,6 @@
 """Conditions of the causes that all drives share: supply, temperature, enable input, following error, limits.
 
-A condition is asked once per supervision period: `told` says whether the cause was there at the last look.
+A condition is evaluated once per supervision period: `told` is whether the cause was present at the previous one.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from drive_env.firmware.common.protection import (
 )
 from mechanics.kernels.compiled import stage
 
-HOMING = 6  # limit switches are what homing looks for
+HOMING = 6  # homing searches the limit switches
 
 
 @stage
@@ -62,13 +62,13 @@ def following_error(drive, lane, told):
 
 @stage
 def _limits_count(drive, lane):
-    """Return whether limits are looked at: homing searches the switches, and before it positions mean nothing."""
+    """Return whether limits are checked: not in homing, which searches switches, nor before positions are valid."""
     return drive.drive_function[lane] > 0.0 and drive.mode_display[lane] != HOMING
 
 
 @stage
 def above_limit(drive, lane, told):
-    """Return whether axis or demand is past the upper software limit (section 6.1.11); one told lasts to its edge."""
+    """Return whether axis or demand is past the upper software limit (section 6.1.11); once reported, to its edge."""
     margin = 0.0 if told else limits.LIMIT_MARGIN
     past = drive.theta_meas[lane] > limits.corrected_maximum(drive, lane) + margin
     return _limits_count(drive, lane) and (past or limits.demand_above(drive, lane))
@@ -100,8 +100,8 @@ LIMITS_AND_NETWORK = (
     Cause("negative_software_limit", LIMIT, LIMIT_REGISTER, 0x0, below_limit, BLOCKS_NEGATIVE, software=True),
     Cause("positive_limit_switch", LIMIT, LIMIT_REGISTER, 0x0, positive_switch, BLOCKS_POSITIVE),
     Cause("negative_limit_switch", LIMIT, LIMIT_REGISTER, 0x0, negative_switch, BLOCKS_NEGATIVE),
-    # From outside the axis: its network was stopped or lost.
+    # Causes outside the axis: its network was stopped or lost.
     Cause(COMMUNICATION, STOP, 0x10, 0x0),
-    # The axis has left its limits: 0000h too, as CiA 301 has it, but no command, and nothing else ends with it.
+    # The axis has left its limits: 0000h, too, as in CiA 301, but it is no command, and ends nothing else.
     Cause(FAULT_RESET, WARN, 0x00, 0x0),
 )

@@ -1,12 +1,12 @@
-"""The DC link between supply and bridge: its fields, a tick's constants, and what a tick does to link and rotor."""
+"""The DC link between supply and bridge: its fields, a tick's constants, and the effect of a tick on link and rotor."""
 
 from __future__ import annotations
 
 from drive_env.firmware.record import LANES, Field
 from mechanics.kernels.compiled import inlined
 
-SMALLEST_RESISTANCE = 1e-15  # ohm; a supply without resistance is one that holds its voltage
-SMALLEST_VOLTAGE = 1e-3  # V; an empty DC link divides nothing
+SMALLEST_RESISTANCE = 1e-15  # ohm; a supply without resistance holds its voltage
+SMALLEST_VOLTAGE = 1e-3  # V; avoids a division by an empty DC link's 0
 ENDLESS = 1e300  # V
 
 PARAMETERS = (
@@ -48,8 +48,8 @@ def derive_link(drive, dt):
 def drain_link(drive, lane, drained):
     """Take a current [A] from the link for a tick: writes u_dc [V].
 
-    The source feeds through a diode, so braking charges the link, unless it is one that sinks current, too. A short
-    circuit is implicit: it may empty the link within a tick.
+    The source feeds through a diode, so braking charges the link, unless the source also sinks current. A short circuit
+    is implicit: it may empty the link within a tick.
     """
     left = drive.u_dc[lane] - drive.link_step[lane] * drained
     supply = drive.supply_voltage[lane]
@@ -66,8 +66,8 @@ def turn_rotor(drive, lane, torque, dt, progress):
 
     Args:
         drive: The record.
-        lane: Of the axis.
-        torque: Of the motor [N*m], without the load's reaction.
+        lane: Lane of the axis.
+        torque: Torque of the motor [N*m], without the load's reaction.
         dt: Current-loop period [s].
         progress: Middle of this tick, as a share of the window, plus one half: the load's reaction is extrapolated
             from the middles of the last two windows to it.

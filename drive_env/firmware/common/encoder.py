@@ -1,4 +1,4 @@
-"""The incremental encoder, as every kind of drive counts it: its fields, its noise, and what the counter shows."""
+"""The incremental encoder for all kinds of drives: its fields, noise, and counter."""
 
 from __future__ import annotations
 
@@ -59,9 +59,9 @@ def shake_encoders(drive):
 
 @inlined
 def encoder_count(edges, backwards):
-    """Return what the counter shows after so many edges, whole or not: counted backwards below 0 where that is 1.
+    """Return the counter after a number of edges, whole or not; backwards if `backwards` is 1.
 
-    Edge 0 lies between 0 and -1, however it is wired: the drive's own direction, 2080h:01, gives the same angle again.
+    Edge 0 lies between 0 and -1 for both wirings: the drive's direction, 2080h:01, restores the angle.
     """
     count = np.floor(edges)
     return count + backwards * (-1.0 - 2.0 * count)
@@ -70,7 +70,7 @@ def encoder_count(edges, backwards):
 @inlined
 def derive_counter(drive, lane):
     """Compute the quotients of the encoder: writes turns_per_count and counts_per_rad."""
-    # 2080h:02 and 608Fh may be 0, which is no encoder that could be counted with.
+    # 2080h:02 and 608Fh may be 0, with which no encoder can be counted.
     steps = drive.encoder_steps[lane] * drive.encoder_interpolation[lane]
     steps = steps if steps > 0.0 else 1.0
     drive.turns_per_count[lane] = (1.0 - 2.0 * drive.encoder_direction[lane]) / steps
@@ -79,14 +79,14 @@ def derive_counter(drive, lane):
 
 @inlined
 def count_at(drive, lane, angle):
-    """Return what the counter shows at an angle of the disc [rad]; that of an encoder that is broken stands still."""
+    """Return the counter at an angle of the disc [rad]; a broken encoder's does not change."""
     count = encoder_count(angle * drive.counts_per_rad[lane], drive.encoder_true_direction[lane])
     return drive.count[lane] if drive.encoder_broken[lane] > 0.5 else count
 
 
 @inlined
 def read_counter(drive, lane):
-    """Find the disc's error, and return what the counter shows now."""
+    """Compute the disc's error, and return the present counter."""
     s, _ = sine_cosine(drive.theta_m[lane] + drive.encoder_line_phase[lane])
     drive.encoder_error[lane] = drive.encoder_line_error[lane] * s + drive.encoder_shake[lane]
     return count_at(drive, lane, drive.theta_m[lane] + drive.encoder_error[lane])
@@ -94,14 +94,14 @@ def read_counter(drive, lane):
 
 @inlined
 def forget_velocity(drive, lane):
-    """Begin the velocity filter anew."""
+    """Reset the velocity filter."""
     drive.velocity_filter_z[0, lane] = 0.0
     drive.velocity_filter_z[1, lane] = 0.0
 
 
 @inlined
 def start_counter(drive, lane):
-    """Begin counting where the disc stands, and return its edges there."""
+    """Start counting at the disc's present angle, and return its edges there."""
     forget_velocity(drive, lane)
     s, _ = sine_cosine(drive.theta_m[lane] + drive.encoder_line_phase[lane])
     drive.encoder_error[lane] = drive.encoder_line_error[lane] * s
@@ -116,14 +116,14 @@ def find_noise(drive):
     """Write whether a lane of the block has a noisy encoder."""
     drive.block_has_noisy_encoder[0] = 0
     for lane in range(LANES):
-        # Once more after the noise has ended, so that none of it is left in the angle.
+        # Once more after the noise has ended, so that the angle contains none of it.
         if drive.encoder_noise[lane] > 0.0 or drive.encoder_shake[lane] != 0.0:
             drive.block_has_noisy_encoder[0] = 1
 
 
 @inlined
 def filtered_velocity(drive, lane, raw):
-    """Return a velocity [rad/s] after the second-order low-pass, whose state it moves on by a window."""
+    """Return a velocity [rad/s] after the second-order low-pass, whose state it advances by a window."""
     b = drive.velocity_filter_b[lane]
     omega = b * raw + drive.velocity_filter_z[0, lane]
     drive.velocity_filter_z[0, lane] = (
@@ -135,14 +135,14 @@ def filtered_velocity(drive, lane, raw):
 
 @inlined
 def index_in_window(drive, lane, edges, first, up):
-    """Return whether the index came in the window that has passed, at which edge, and the count there.
+    """Return whether the index came in the last window, at which edge, and the count there.
 
     Args:
         drive: The record.
-        lane: Of the axis.
-        edges: Of the disc at its present angle.
+        lane: Lane of the axis.
+        edges: Edges of the disc at its present angle.
         first: Edge at which the index becomes active in that direction, of any turn.
-        up: 1: it turned upwards, or stood; 0: downwards.
+        up: 1 if it turned upwards, or stood; 0 if downwards.
     """
     counts = drive.encoder_counts[lane]
     before = drive.true_edges[lane]

@@ -1,7 +1,7 @@
-"""What every drive's record has: what the automaton, modes, inputs and protection read and write.
+"""Fields of every drive's record: those that the automaton, modes, inputs and protection read and write.
 
 A device's own stages share some of these: they write theta_meas, omega_meas, counts_per_turn, T_stage, u_dc, stage_on
-and init_state, and tau_window with moment_window, what each physics step of a window has of the motor; they read the
+and init_state, and tau_window with moment_window, the motor's torque in each physics step of a window; they read the
 demands, loop_level, drive_function, theta_m, omega_m and tau_reaction.
 """
 
@@ -43,7 +43,7 @@ PARAMETERS = (
     Field("acceleration", "f8", "rad/s^2", "6083h"),
     Field("deceleration", "f8", "rad/s^2", "6084h"),
     Field("quick_stop_deceleration", "f8", "rad/s^2", "6085h"),
-    # Of the velocity mode of frequency inverters; a drive without it leaves them so.
+    # Of the velocity mode of frequency inverters; unused by drives without it.
     Field("vl_target", "f8", "rad/s", "6042h"),
     Field("vl_min", "f8", "rad/s", "6046h:01: least speed of what turns"),
     Field("vl_max", "f8", "rad/s", "6046h:02: highest speed", math.inf),
@@ -63,7 +63,7 @@ PARAMETERS = (
     Field("vl_brake_time", "f8", "s", "6051h: the same at a quick stop; infinite: as 6085h", math.inf),
     Field("velocity_ratio", "f8", "rpm", "604Ch, or 6094h: of a velocity unit", 1.0),
     Field("set_point_ratio", "f8", "1", "604Bh: velocity units of 6042h and 6043h", 1.0),
-    # Of a six-point ramp; a drive without one leaves them 0.
+    # Of a six-point ramp; 0 for drives without one.
     Field("start_velocity", "f8", "rad/s", "2010h: jumped to at the beginning of a ramp"),
     Field("end_velocity", "f8", "rad/s", "6082h: jumped from at its end, or where the ramp of 2014h begins"),
     Field("stop_deceleration", "f8", "rad/s^2", "2014h: ramp from the end velocity to rest; 0: a jump"),
@@ -71,27 +71,27 @@ PARAMETERS = (
     Field("acceleration_1", "f8", "rad/s^2", "2011h; 0: as above 2012h"),
     Field("deceleration_1", "f8", "rad/s^2", "2013h; 0: as above 2012h"),
     Field("ramp_wait", "f8", "s", "2015h: wait after a ramp before the next motion"),
-    # Of a brake output (brake.py); a drive without one leaves them 0.
+    # Of a brake output (brake.py); 0 for drives without one.
     Field("enable_delay", "f8", "s", "200Ah: from current in the motor to releasing the brake"),
     Field("brake_apply_delay", "f8", "s", "2002h:01: from applying the brake to switching the stage off"),
     Field("brake_release_delay", "f8", "s", "2002h:02: from releasing the brake to operation enabled"),
     Field("brake_apply_current", "f8", "", "200Ch:01: 0...255 of the output's largest, while the brake is applied"),
     Field("brake_release_current", "f8", "", "200Ch:02: the same, while it is released; both 0: left to others"),
-    # Of an S-shaped ramp; a drive without one leaves them 0.
+    # Of an S-shaped ramp; 0 for drives without one.
     Field("profile_type", "f8", "", "6086h: 0 linear, 1 S-shaped"),
     Field("jerk_1", "f8", "rad/s^3", "60A4h:01: begins an acceleration; 0: at once"),
     Field("jerk_2", "f8", "rad/s^3", "60A4h:02: ends it"),
     Field("jerk_3", "f8", "rad/s^3", "60A4h:03: begins a deceleration"),
     Field("jerk_4", "f8", "rad/s^3", "60A4h:04: ends it"),
     Field("jerk_factor", "f8", "1", "times each of them: 2015h of drives that have S-shaped ramps", 1.0),
-    # Of the shaped ramps (shaped.py); a drive without them leaves it 0.
+    # Of the shaped ramps (shaped.py); 0 for drives without them.
     Field("profile_shape", "f8", "", "6086h: -3 sinusoidal, -2 and -1 fast and slow, 0 trapezoid, 1 sin^2"),
     Field("position_window", "f8", "rad", "6067h; inf: switched off"),
     Field("position_window_time", "f8", "s", "6068h"),
     Field("following_error_window", "f8", "rad", "6065h; 0: switched off"),
     Field("position_min", "f8", "rad", "607Dh:01"),
     Field("position_max", "f8", "rad", "607Dh:02"),
-    # Quirks of a device (drive_env/devices/drive_quirks.py); one without them leaves them 0.
+    # Quirks of a device (drive_env/devices/drive_quirks.py); 0 for devices without them.
     Field("mode_delay", "f8", "s", "from a write of 6060h until the mode changes"),
     Field("mode_needs_halt", "i4", "", "1: an enabled axis changes its mode only at rest, with halt set"),
     Field("absent_status_bits", "i4", "", "bits of 6041h that are never set"),
@@ -107,7 +107,7 @@ PARAMETERS = (
     Field("standstill", "f8", "rad/s", "speed below which the motor counts as standing still"),
     Field("supply_voltage", "f8", "V", "open-circuit voltage of the supply"),
     # --- the motor as it is ---------------------------------------------------------------------------------------
-    # Faults that come and go (drive_env/faults); a sound machine has the initial values.
+    # Temporary faults (drive_env/faults); a faultless machine has the initial values.
     Field("wired", "i4", "", "inputs (bits of 60FDh) that a switch is connected to"),
     Field("enable_input", "i4", "", "1: the enable input is closed", 1),
     Field("switch_low", "f8", "rad or m", "where the left, right and home switch begin to be pressed", depth=3),
@@ -119,7 +119,7 @@ PARAMETERS = (
     Field("brake_closes_in", "f8", "s", "from its drop-out current on"),
 )
 
-# What changes while the drive runs; a machine that is reset starts from the initial values.
+# Variables of the running drive; a reset of the machine restores their initial values.
 STATE = (
     # --- state: finite state automaton, profile -------------------------------------------------------------------
     Field("diverged", "i4", "", "1: the axis left the range of physics and is frozen"),

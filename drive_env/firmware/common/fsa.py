@@ -1,7 +1,7 @@
 """The finite state automaton of CiA 402: controlword to state, state to statusword.
 
-States, commands and transitions are the manual's figure 4 and tables 142, 143 and 149. What a transition does beside
-changing the state is in `_enter`.
+States, commands and transitions are the manual's figure 4 and tables 142, 143 and 149. Further effects of a transition
+are in `_enter`.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Transition(NamedTuple):
 TRANSITIONS = (
     Transition(2, State.SWITCH_ON_DISABLED, SHUTDOWN, State.READY_TO_SWITCH_ON),
     Transition(3, State.READY_TO_SWITCH_ON, SWITCH_ON, State.SWITCHED_ON),
-    # "Switch on & enable operation" takes transitions 3 and 4: after this row the controlword is looked at again.
+    # "Switch on & enable operation" makes transitions 3 and 4: after this row the controlword is evaluated again.
     Transition(3, State.READY_TO_SWITCH_ON, ENABLE_OPERATION, State.SWITCHED_ON),
     Transition(4, State.SWITCHED_ON, ENABLE_OPERATION, State.OPERATION_ENABLED),
     Transition(5, State.OPERATION_ENABLED, DISABLE_OPERATION, State.SWITCHED_ON),
@@ -57,7 +57,7 @@ TRANSITIONS = (
 _ROWS = np.array([(t.number, t.start, t.command.mask, t.command.value, t.end) for t in TRANSITIONS], np.int32)
 _CODING = np.array([STATE_CODING[state][1] for state in State], np.int32)
 
-# As plain integers: an IntEnum member inside a kernel is an object to the compiler.
+# Plain integers: the compiler treats an IntEnum member in a kernel as an object.
 NOT_READY = int(State.NOT_READY_TO_SWITCH_ON)
 DISABLED = int(State.SWITCH_ON_DISABLED)
 SWITCHED = int(State.SWITCHED_ON)
@@ -72,12 +72,12 @@ WARNING_BIT, REMOTE_BIT = cia402.WARNING.value, cia402.REMOTE.value
 # Rows of every device's emergency table that the automaton itself sends.
 EMERGENCY_RESET = 0
 
-LONGEST_STOP = 1.0  # s after the ramp's end; a motor that still turns then is not held by its loops
-STANDSTILL_NOISE = 2.0  # what the unfiltered velocity may show at rest, as a multiple of the standstill threshold
+LONGEST_STOP = 1.0  # s after the ramp's end; the loops cannot hold a motor that still turns then
+STANDSTILL_NOISE = 2.0  # the unfiltered velocity at rest, as a multiple of the standstill threshold
 
-# Option codes of 605Ah that end in switch on disabled, and those that ramp with 6085h.
+# Option codes of 605Ah that end in switch on disabled, and those whose ramp is 6085h.
 STOP_AND_STAY = 5
-# Transitions that leave a current which waits for the brake as it is; any other takes it away.
+# Transitions that keep a current which waits for the brake; all others cut it.
 KEEPS_HOLDING = (2, 3, 6, 15)
 
 
@@ -86,7 +86,7 @@ def push_emergency(drive, lane, row):
     """Queue a row of the device's emergency table; a full queue loses the newest, as a transmit buffer does."""
     count = drive.emergency_count[lane]
     if count < EMERGENCY_QUEUE:
-        # With the error register of this moment, which a reset clears before the message may be fetched.
+        # With the present error register, which a reset may clear before the message is fetched.
         drive.emergency[count, lane] = (row + 1) | drive.error_register[lane] << 8
         drive.emergency_count[lane] = count + 1
 
@@ -99,26 +99,26 @@ def has_drive_function(state):
 
 @stage
 def _enter(drive, lane, number, end):
-    """Make transition `number` to the state `end`, with what it does to the axis."""
+    """Make transition `number` to the state `end`, with its effects on the axis."""
     drive.fsa[lane] = end
     drive.transition_pending[lane] = 0
     if number not in KEEPS_HOLDING:
         drive.holding[lane] = 0
     if number == 4:
         drive.position_demand[lane] = drive.theta_meas[lane]
-        # An axis that turns already is taken over at its speed.
+        # A turning axis is enabled at its present speed.
         turns = abs(drive.omega_slow[lane]) > drive.standstill[lane]
         drive.velocity_demand[lane] = drive.omega_meas[lane] if turns else 0.0
         drive.torque_demand[lane] = 0.0
         drive.velocity_sum[lane] = 0.0
     if number == 4 or number == 16:
-        # No set-point of before moves the axis: a new one must be given.
+        # Earlier set-points do not move the axis: a new one must be given.
         drive.set_point_valid[lane] = 0
         drive.stopping[lane] = 0
     if number == 11 or number == 13:
         drive.stopping[lane] = 1
         drive.stop_time[lane] = 0.0
-        drive.braking[lane] = 0  # a halt's ramp that was under way is this one's no longer: it begins with the motion
+        drive.braking[lane] = 0  # the ramp of a halt under way is replaced: the stop begins with the present motion
     if number == 15:
         drive.fault[lane] = 0
         drive.error_register[lane] = 0
@@ -133,20 +133,19 @@ def _enter(drive, lane, number, end):
 
 @stage
 def _commands_operation(word):
-    """Return whether a controlword commands operation enabled."""
     return word & ENABLE_MASK == ENABLE_VALUE
 
 
 @stage
 def command(drive, lane):
-    """Process the controlword completely: every transition that it commands from the present state.
+    """Process the controlword completely: make every transition that it commands from the present state.
 
     While a disable-operation ramp runs (transition 5) other commands wait until it has ended, as the manual's note
     demands; only disable voltage is obeyed at once, since it takes the energy away.
     """
     word = drive.controlword[lane]
     if drive.transition_pending[lane] == 4 and not _commands_operation(word):
-        # Enabling is called off before the axis was enabled: the brake closes, and the stage waits for it.
+        # Enabling is cancelled before the axis was enabled: the brake closes, and the stage waits for it.
         drive.transition_pending[lane] = 0
         drive.holding[lane] = 0
         brake.hold_until_closed(drive, lane)
@@ -189,9 +188,9 @@ def reset_fault(drive, lane, causes_gone):
 
 @stage
 def has_stopped(drive, lane, dt):
-    """Return whether a stop ramp has ended and the motor stands; one that will not stand is given up on.
+    """Return whether a stop ramp has ended and the motor stands; for a motor that does not stop the wait is limited.
 
-    The power goes off after the stop: taken at the ramp's end alone it would leave a soft axis coasting.
+    The power goes off only after the stop: at the ramp's end a soft axis would still coast.
     """
     if drive.velocity_demand[lane] != 0.0:
         drive.stop_time[lane] = 0.0
@@ -205,7 +204,7 @@ def has_stopped(drive, lane, dt):
 
 @stage
 def automatic_transitions(drive, lane, dt):
-    """Make the transitions that need no command, once per period of dt [s]: 1, and what waited for standstill."""
+    """Make the transitions that need no command, once per period of dt [s]: 1, and those that waited for standstill."""
     if drive.fsa[lane] == NOT_READY:
         _enter(drive, lane, 1, DISABLED)
     if drive.transition_pending[lane] == 4 and drive.switching_time[lane] + 0.5 * dt > brake.enabling_time(drive, lane):
@@ -227,7 +226,7 @@ def automatic_transitions(drive, lane, dt):
 
 @stage
 def fault(drive, lane, cut):
-    """Take transition 13; with `cut` the stage is switched off at once and 14 follows."""
+    """Take transition 13; with `cut` the stage is switched off at once, and 14 follows."""
     if drive.fsa[lane] == FAULTED or (drive.fsa[lane] == REACTING and not cut):
         return
     if cut or not has_drive_function(drive.fsa[lane]):
@@ -240,16 +239,15 @@ def fault(drive, lane, cut):
 def update_statusword(drive, lane, mode_bits):
     """Write 6041h and the status flags from the state; `mode_bits` are bits 11 to 13.
 
-    Bit 4 tells that the supply is present, bit 9 (remote) is set here: drives that take commands from elsewhere, too,
-    clear it themselves.
-    Bit 15 is set while the motor turns in the negative direction (the manual does not say which).
+    Bit 4 shows that the supply is present; bit 9 (remote) is set here and cleared by drives that also take commands
+    from elsewhere. Bit 15 is set while the motor turns in the negative direction (the manual does not say which).
     """
     state = drive.fsa[lane]
     word = _CODING[state]
     if drive.u_dc[lane] > drive.undervoltage[lane]:
         word |= 0x0010
     if state in (DISABLED, FAULTED, REACTING, NOT_READY) and drive.controlword[lane] & 0x0004:
-        word |= 0x0020  # bit 5 is free in these states: it shows that no quick stop is commanded
+        word |= 0x0020  # bit 5 is 1 in these states: it shows that no quick stop is commanded
     word |= REMOTE_BIT
     if drive.target_reached[lane]:
         word |= 0x0400

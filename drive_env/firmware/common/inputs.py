@@ -1,4 +1,4 @@
-"""Digital inputs: limit switches, home switch and enable, as the load presses them and as 2005h reads them."""
+"""Digital inputs: limit switches, home switch and enable, as pressed by the load, and as interpreted by 2005h."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _INVERT = (0x04, 0x08, 0x20)
 
 @stage
 def read_inputs(drive, lane):
-    """Write the inputs' levels (60FDh). An input that nothing is connected to reads active."""
+    """Write the inputs' levels (60FDh). An unconnected input reads active."""
     levels = ENABLE if drive.enable_input[lane] == 1 else 0
     x = drive.load_position[lane]
     for k in range(3):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from mechanics.kernels.compiled import stage
 
 ROUNDING = 1e-9  # rad: a target at the corrected limit itself is within it
-# rad, one degree of the rotor: an axis that is held at its limit moves by less, and is not told of.
+# rad, one degree of the rotor: an axis held at its limit moves by less, and is not reported.
 LIMIT_MARGIN = 0.017453292519943295
 
 
@@ -25,8 +25,8 @@ def corrected_maximum(drive, lane):
 def demand_above(drive, lane):
     """Return whether the position demand is past the upper limit.
 
-    Only position modes have such a demand: what the velocity modes integrate for 6062h is shifted against the axis by a
-    load that pushes it.
+    Only position modes have such a demand: the one that velocity modes integrate for 6062h drifts from an axis that a
+    load pushes.
     """
     return drive.loop_level[lane] == 2 and drive.position_demand[lane] > corrected_maximum(drive, lane)
 

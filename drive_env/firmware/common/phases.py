@@ -1,14 +1,14 @@
-"""What two phases show, whatever the bridge: broken cables, the largest currents, and a phase without current."""
+"""Monitoring of two phases of any bridge: broken cables, largest currents, and a phase without current."""
 
 from __future__ import annotations
 
 from drive_env.firmware.record import Field
 from mechanics.kernels.compiled import inlined, stage
 
-OPEN_LOAD_TIME = 0.05  # s for which a phase must stay without the current that is asked for
+OPEN_LOAD_TIME = 0.05  # s for which a phase may lack the demanded current
 
 PARAMETERS = (
-    # Faults that come and go (drive_env/faults); a sound machine has the initial values.
+    # Temporary faults (drive_env/faults); a faultless machine has the initial values.
     Field("open_a", "f8", "", "1: the cable of phase A is broken"),
     Field("open_b", "f8", "", "1: the cable of phase B is broken"),
 )
@@ -36,7 +36,7 @@ def note_peaks(drive, lane, i_a, i_b):
 
 @stage
 def forget_peaks(drive, lane, dt):
-    """Begin the next period's largest currents, after protection has looked at this one's."""
+    """Restart the largest currents for the next period, after protection has checked this one's."""
     drive.peak_a[lane] = 0.0
     drive.peak_b[lane] = 0.0
 

@@ -1,7 +1,8 @@
 """Trapezoidal profile: the time-optimal way from (x, v) to rest at the target, one period at a time, in closed form.
 
-Every period plans the rest of the move anew from where it is and goes one period along it. On an undisturbed move
-that reproduces the one analytic trapezoid or triangle exactly, and a changed target, velocity or ramp needs no case.
+Every period plans the rest of the move anew from its present state and advances by one period. On an undisturbed move
+that reproduces the analytic trapezoid or triangle exactly, and a changed target, velocity or ramp needs no special
+case.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ def ramp(v, v_end, rate, dt):
 
 @stage
 def limited(v, limit):
-    """Return a velocity [rad/s] within a limit of its size, positive; a limit of 0 is none."""
+    """Return a velocity [rad/s] limited in absolute value; a limit of 0 means no limit."""
     return v if limit <= 0.0 else min(max(v, -limit), limit)
 
 
@@ -43,7 +44,7 @@ def unwrapped(target, position, scaler):
 
 @stage
 def nearest(target, position, scaler):
-    """Return what an absolute target [rad] means of all that differ by turns of the 32-bit counter: the nearest."""
+    """Return the nearest of all positions [rad] that differ from a target by turns of the 32-bit counter."""
     turn = 4294967296.0 * 6.283185307179586 / scaler
     return target + turn * math.floor((position - target) / turn + 0.5)
 
@@ -75,7 +76,7 @@ def trapezoid(x, v, target, v_max, a_up, a_down, dt):
     """
     if v == 0.0 and x == target:
         return x, 0.0
-    # The side on which the target lies once the axis has stopped decides the direction of what follows.
+    # The direction follows from the side on which the target is once the axis has stopped.
     beyond = target - x - 0.5 * v * abs(v) / a_down
     sign = 1.0 if beyond > 0.0 or (beyond == 0.0 and v > 0.0) else -1.0
     distance = sign * (target - x)

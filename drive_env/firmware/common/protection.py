@@ -1,9 +1,9 @@
-"""Protection: the causes that a drive watches, once per supervision period, and what each does.
+"""Protection: the causes that a drive monitors, once per supervision period, and their reactions.
 
 A cause is a physical condition of the axis, and a row of the table that a device's firmware names. Its emergency code
-and bytes are the device's data, by name; which cause has which reaction stands in its row: what endangers the stage
-cuts it, what endangers the machine stops it with the fault reaction of 605Eh, a limit of travel stops the axis and
-stays enabled, a warning only tells.
+and bytes are the device's data, by name; each row has the reaction: a danger to the stage cuts it, a danger to the
+machine stops it with the fault reaction of 605Eh, a limit of travel stops the axis, which stays enabled, and a warning
+is only reported.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from mechanics.kernels.compiled import inlined, stage
 CUT, STOP, LIMIT, WARN = 0, 1, 2, 3
 BLOCKS_NEGATIVE, BLOCKS_POSITIVE = 1, 2
 GENERIC_ERROR = 0x01  # bit 0 of 1001h is set with every error
-LIMIT_REGISTER = 0x20  # of 1001h, of an axis at a limit
-# Names that the core itself asks for.
+LIMIT_REGISTER = 0x20  # of 1001h, for an axis at a limit
+# Names that the core itself uses.
 FAULT_RESET, COMMUNICATION, FOLLOWING_ERROR = "fault_reset", "communication_error", "following_error"
 
 
@@ -31,16 +31,16 @@ class Cause(NamedTuple):
         name: As in the device's emergency table.
         reaction: CUT, STOP, LIMIT or WARN.
         error_register: Bits of 1001h.
-        status_flag: Bits of the device's status flags, where it has them.
-        condition: Stage (drive, lane, whether it was there at the last look) -> whether it is there; None of what
-            comes from outside the axis, or is told by the automaton.
-        blocks: BLOCKS_NEGATIVE or BLOCKS_POSITIVE, of a limit.
+        status_flag: Bits of the device's status flags, if it has them.
+        condition: Stage (drive, lane, whether it was present at the last check) -> whether it is present; None for a
+            cause outside the axis, or reported by the automaton.
+        blocks: BLOCKS_NEGATIVE or BLOCKS_POSITIVE, for a limit.
         software: Whether it is a software limit, from which a demand within the limits leads back.
         held: Whether it is over as soon as the stage is off, so that its flag stays until the reset.
         tried_again: Whether a reset is allowed although it holds: the next enabling tries again.
         unless: Name of a cause whose fault hides this one, which then follows from it.
-        known_as: Name by which the core asks for it, where a device calls it otherwise.
-        silent: Whether it acts without an emergency, and without a bit of 1001h: of a limit that is no error.
+        known_as: Name in the core, if the device uses another one.
+        silent: Whether it acts without an emergency and without a bit of 1001h, as a limit that is not an error.
     """
 
     name: str
@@ -61,8 +61,8 @@ class Protection(NamedTuple):
     """Stages of a table of causes.
 
     Attributes:
-        protect: (drive, lane): looks at every cause, once per supervision period.
-        causes_gone: (drive, lane) -> whether no cause that takes the drive into fault holds any more.
+        protect: (drive, lane): checks every cause, once per supervision period.
+        causes_gone: (drive, lane) -> whether no cause of a fault is present any more.
         statusword_bits: (drive, lane) -> bits 11 and 13 of the statusword that causes set.
         trip: (drive, lane, row): takes an axis that is in operation into fault.
     """
@@ -78,15 +78,15 @@ def _mask(causes: Sequence[Cause], chosen: Callable[[Cause], bool]) -> int:
 
 
 def row_of(causes: Sequence[Cause], name: str) -> int:
-    """Return the first row of a cause, by its name or what it is known as; -1 where the table has none."""
+    """Return the first row of a cause, by its name or `known_as`; -1 if the table has none."""
     return next((row for row, cause in enumerate(causes) if name in (cause.name, cause.known_as)), -1)
 
 
-TOGETHER = 4  # conditions in one function: each function takes the compiler's time, and each nested in another more
+TOGETHER = 4  # conditions per function: each function costs compile time, and each nested one more
 
 
 def _conditions(causes: Sequence[Cause]) -> Any:
-    """Return the stage (drive, lane) -> the causes whose condition holds now, as bits 1 << row."""
+    """Return the stage (drive, lane) -> the causes that are present now, as bits 1 << row."""
     rows: list[tuple[Any, int]] = []
     for row, cause in enumerate(causes):
         if cause.condition is not None:
@@ -139,7 +139,7 @@ def _either(first: Any, second: Any) -> Any:
 
 
 class _Masks(NamedTuple):
-    """Rows of a table as bits 1 << row, by what they do."""
+    """Rows of a table as bits 1 << row, by their effect."""
 
     cuts: int
     stops: int
@@ -154,7 +154,7 @@ class _Masks(NamedTuple):
 
     @property
     def faults(self) -> int:
-        """What takes the drive into fault."""
+        """The causes that take the drive into fault."""
         return self.cuts | self.stops
 
 
@@ -181,7 +181,7 @@ def _look(masks: _Masks, conditions: Any, told_when_left: int, tells_all: bool, 
 
     @stage
     def demand_beyond(drive, lane):
-        """Return the software limits that the position demand is past."""
+        """Return the software limits that the position demand exceeds."""
         return (software_positive if limits.demand_above(drive, lane) else 0) | (
             software_negative if limits.demand_below(drive, lane) else 0
         )
@@ -193,26 +193,26 @@ def _look(masks: _Masks, conditions: Any, told_when_left: int, tells_all: bool, 
         faulted = drive.fsa[lane] == fsa.FAULTED
         is_off = drive.fsa[lane] < fsa.SWITCHED and not faults_when_off
         if is_off or (faulted and not tells_all):
-            # A drive whose supply or enable is missing is in no fault before anybody switches it on, unless its maker
-            # has every error act at once.
+            # A drive whose supply or enable is missing is not in fault before it is switched on, unless its maker lets
+            # every error act at once.
             present &= ~faults
         reacting = drive.fsa[lane] == fsa.REACTING
-        # Outside of a fault none is known already: what is back in the moment of its reset is a new one.
+        # Outside a fault no cause counts as known: one that is back at its reset is new.
         known = drive.active[lane] if faulted or reacting else drive.active[lane] & ~faults
         appeared = present & ~known
-        # Until the fault reaction has ended, what began it is no new occurrence when it goes and comes again; where
-        # every error is told, none is until the reset.
+        # Until the fault reaction has ended, its cause is not new if it goes and returns; if every error is reported,
+        # not before the reset.
         told = drive.active[lane] & stops if reacting else 0
         if tells_all and (faulted or reacting):
             told = drive.active[lane] & faults
         drive.active[lane] = present | told
         drive.warning[lane] = 1 if present & warns else 0
-        # A position demand that is within the limits leads an axis back that was pushed past them.
+        # A position demand within the limits leads an axis back that was pushed past them.
         blocking = present & ~software | demand_beyond(drive, lane) if drive.loop_level[lane] == 2 else present
         drive.blocked[lane] = (BLOCKS_POSITIVE if blocking & positive else 0) | (
             BLOCKS_NEGATIVE if blocking & negative else 0
         )
-        # A limit shows in 1001h while it lasts; what made a fault stays there until the reset.
+        # A limit is shown in 1001h while it is present; the cause of a fault stays there until the reset.
         if present & at_limits:
             drive.error_register[lane] |= GENERIC_ERROR | LIMIT_REGISTER
         elif drive.fault[lane] == 0 and drive.error_register[lane] != 0:
@@ -235,7 +235,7 @@ def _react(masks: _Masks, register: tuple[int, ...], tells_all: bool) -> Any:
             push_emergency = silent & (1 << cause) == 0
             if faults & (1 << cause):
                 cut = cuts & (1 << cause) != 0
-                # The stage that is cut has answered: what else it sees in the same moment follows from it.
+                # The cut stage is the answer: other causes at the same time follow from it.
                 is_first = drive.fsa[lane] != fsa.FAULTED
                 push_emergency = is_first or tells_all
                 if push_emergency:
@@ -255,7 +255,7 @@ def _cause_flags(held: int, flags: tuple[int, ...], tells_all: bool) -> Any:
 
     @inlined
     def cause_flags(drive, lane):
-        """Return the status flags of what is wrong now, in whatever state the drive is."""
+        """Return the status flags of present causes, in any state of the drive."""
         shown = drive.present[lane]
         if drive.fault[lane] > 0:
             shown |= 1 << (drive.fault[lane] - 1) & held
@@ -274,10 +274,10 @@ def protection_of(causes: Sequence[Cause], *, tells_all: bool = False, faults_wh
     """Return the stages of a table of causes.
 
     Args:
-        causes: Row 0 is the answer to a fault reset; the last one tells that the axis has left its limits. Causes that
-            appear together are told, and act, in the order of the rows.
-        tells_all: Whether a drive in fault tells of further errors, each once until the reset; otherwise what else the
-            stage that is cut sees follows from it, and is not told.
+        causes: Row 0 is the answer to a fault reset; the last one reports that the axis has left its limits. Causes
+            that appear together are reported, and act, in the order of the rows.
+        tells_all: Whether a drive in fault reports further errors, each once until the reset; otherwise errors after
+            the cut of the stage count as its consequences, and are not reported.
         faults_when_off: Whether a cause takes the drive into fault in every state, or from switched on only.
     """
     masks = _masks(causes)

@@ -6,10 +6,10 @@ r"""The S-shaped ramp: accelerations rise and fall with four bows, one jerk for 
                                       \      /
                                        \____/
 
-As the TMC4361 has it (data sheet, "S-shaped ramps"). A change of speed has up to four parts of constant jerk: what is
-left of an acceleration ends, the next one begins, is held, and ends. A way to a target is a change to the highest speed
-that fits, that speed, and a change to rest. Every period plans the rest of the move anew and goes one period along it,
-so that a changed target, speed, ramp or bow needs no case. Whatever has to turn round comes to rest first.
+As in the TMC4361 (data sheet, "S-shaped ramps"). A change of speed has up to four parts of constant jerk: a remaining
+acceleration ends, the next one begins, is held, and ends. A move to a target is a change to the highest possible speed,
+that speed, and a change to rest. Every period plans the rest of the move anew and advances by one period, so that a
+changed target, speed, ramp or bow needs no special case. An axis that must reverse comes to rest first.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from __future__ import annotations
 from drive_env.firmware.common.arithmetic import TWO_PI
 from mechanics.kernels.compiled import stage
 
-MOST_PARTS = 6  # of a way within one period: braked, turned round and begun anew
-NEAR = 1e-9  # rad: at the target but for rounding
+MOST_PARTS = 6  # of a move within one period: braking, reversal and a new start
+NEAR = 1e-9  # rad: at the target except for rounding
 HALVINGS = 60
-NO_BOW = 1e13  # rad/s^3: a bow of 0 lets the acceleration jump
+NO_BOW = 1e13  # rad/s^3: for a bow of 0 the acceleration jumps
 MOST_JERK = 467.837e9  # microsteps/s^3 (TMCM-3313 manual, section 4.2.16)
 
 
@@ -32,7 +32,7 @@ def is_set(drive, lane):
 
 @stage
 def bow(drive, lane, jerk):
-    """Return the jerk [rad/s^3] of a bow as it acts: times 2015h, and no more than the chip can do."""
+    """Return the effective jerk [rad/s^3] of a bow: times 2015h, limited to that of the chip."""
     most = MOST_JERK * TWO_PI / drive.counts_per_turn[lane]
     return min(jerk * drive.jerk_factor[lane], most) if jerk > 0.0 else NO_BOW
 
@@ -52,12 +52,12 @@ def limits(drive, lane, up, down):
 
 @stage
 def one_way(change, a, rate, begins, ends):
-    """Return times and jerks of a change of speed (> 0) [rad/s] by an acceleration that is a >= 0 already.
+    """Return times and jerks of a change of speed (> 0) [rad/s] by an acceleration whose present value is a >= 0.
 
     Returns:
         Time and jerk of its first part, time for which it is held, time and jerk of its last part.
     """
-    if a > rate:  # the limit was lowered: down to it first
+    if a > rate:  # the limit was lowered: go down to it first
         return (a - rate) / ends, -ends, max((change - 0.5 * a * a / ends) / rate, 0.0), rate / ends, -ends
     peak = ((change + 0.5 * a * a / begins) / (0.5 / begins + 0.5 / ends)) ** 0.5
     peak = max(min(peak, rate), a)
@@ -67,7 +67,7 @@ def one_way(change, a, rate, begins, ends):
 
 @stage
 def settled(u, a, ramp):
-    """Return the speed [rad/s] at which the present acceleration [rad/s^2] has ended, and how long that takes [s]."""
+    """Return the speed [rad/s] once the present acceleration [rad/s^2] has ended, and the time until then [s]."""
     t = a / ramp[3] if a > 0.0 else -a / ramp[5]
     return u + 0.5 * a * t, t
 
@@ -96,7 +96,7 @@ def change_of_speed(u, a, w, ramp):
 
 @stage
 def along(u, a, parts, left):
-    """Go along the parts of a change for `left` [s] at most; return way, speed, acceleration and the time left."""
+    """Advance along the parts of a change for `left` [s] at most; return distance, speed, acceleration, time left."""
     way = 0.0
     for k in range(4):
         t, jerk = min(parts[2 * k], left), parts[2 * k + 1]
@@ -109,7 +109,7 @@ def along(u, a, parts, left):
 
 @stage
 def way_to(u, a, w, ramp):
-    """Return the way [rad] of a change of speed."""
+    """Return the distance [rad] of a change of speed."""
     way, _, _, _ = along(u, a, change_of_speed(u, a, w, ramp), 1e300)
     return way
 
@@ -137,13 +137,13 @@ def peak_speed(u, a, distance, v_max, ramp):
 
 @stage
 def advance(drive, lane, target, v_max, up, down, dt):
-    """Move the demands by dt [s] on the way to rest at the target [rad].
+    """Move the demands by dt [s] towards rest at the target [rad].
 
     Writes position_demand, velocity_demand and acceleration_demand.
 
     Args:
         drive: The record.
-        lane: Of the axis.
+        lane: Lane of the axis.
         target: Where the move ends [rad].
         v_max: Largest speed, positive [rad/s]; an axis that is faster brakes to it first.
         up: Acceleration, positive [rad/s^2].
@@ -190,7 +190,7 @@ def advance(drive, lane, target, v_max, up, down, dt):
 
 @stage
 def approach(drive, lane, target, up, down, dt):
-    """Move the demands by dt [s] on the way to a steady velocity [rad/s]; through rest where its direction changes.
+    """Move the demands by dt [s] towards a steady velocity [rad/s]; through rest if its direction changes.
 
     Writes position_demand, velocity_demand and acceleration_demand.
     """

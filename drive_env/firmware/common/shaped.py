@@ -1,7 +1,7 @@
 r"""Shaped ramps: velocity goes from one value to another along a curve, the motion profile types of servo amplifiers.
 
 A ramp from v to w takes T = k |w - v| / a, where a is the profile acceleration or deceleration and k the greatest slope
-of the curve S, so that a is the greatest acceleration of the ramp whatever its shape:
+of the curve S, so that a is the greatest acceleration of the ramp for any shape:
 
     v(t) = v + (w - v) S(t / T)         type (6086h)  acceleration     deceleration
                                         -3            sine             sine
@@ -10,15 +10,15 @@ of the curve S, so that a is the greatest acceleration of the ramp whatever its 
     early  sin(pi y / 2)                 1            sin^2            sin^2
     late   1 - cos(pi y / 2)
 
-The TGZ manual names the types and no more; the curves are ours. Sine and sin^2 are what the names say of the
-acceleration. "Fast" is full acceleration at once, easing off into the even speed; its mirror image, the fast
-deceleration, ends with the full one at the target. The slow deceleration begins with it and eases off towards the
-target. A deceleration is a ramp to rest: early has its full acceleration at the beginning, late at the end.
+The TGZ manual only names the types; the curves are our choice. Sine and sin^2 are the shapes of the acceleration.
+"Fast" is full acceleration at once, decreasing towards the constant speed; its mirror image, the fast deceleration,
+ends with the full one at the target. The slow deceleration begins with it and decreases towards the target. A
+deceleration is a ramp to rest: early has its full deceleration at the beginning, late at the end.
 
-A move is planned once and followed in time, so that it is the closed form itself and ends at the target exactly.
-Whatever changes in flight (target, speed, rates, type, or a demand that something else moved) begins a new plan at the
-position and the speed there are; the acceleration may jump then, within its limits. What has to turn round, or cannot
-stop on the way that is left, comes to rest first.
+A move is planned once and followed in time, so that it equals the closed form and ends exactly at the target. A change
+during the move (target, speed, rates, type, or a demand moved by something else) begins a new plan at the present
+position and speed; the acceleration may jump then, within its limits. An axis that must reverse, or cannot stop before
+the target, comes to rest first.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ import math
 from mechanics.kernels.compiled import stage
 
 SINE, SINE_SQUARE, EARLY, LATE = 0, 1, 2, 3
-MOST_PARTS = 4  # of a way within one period: brought to rest, turned round and begun anew
-NEAR = 1e-12  # of a way: rounding
+MOST_PARTS = 4  # of a move within one period: stop, reversal and a new start
+NEAR = 1e-12  # of a distance: rounding
 
 # Parts of the record's plan.
 ACTIVE, TIME, START, FROM, SPEED, UP_TIME, CRUISE_TIME, DOWN_TIME, END = range(9)
@@ -83,7 +83,7 @@ def along(curve, y):
 
 @stage
 def _keep(drive, lane, x, v, w, times, end):
-    """Write down a move from position and speed over an even speed w to rest; `times` are those of its three parts."""
+    """Store a move from position and speed over a constant speed w to rest; `times` are those of its three parts."""
     plan = drive.plan
     plan[ACTIVE, lane], plan[TIME, lane] = 1.0, 0.0
     plan[START, lane], plan[FROM, lane], plan[SPEED, lane], plan[END, lane] = x, v, w, end
@@ -92,14 +92,14 @@ def _keep(drive, lane, x, v, w, times, end):
 
 @stage
 def _plan(drive, lane, target, v_max, up, down):
-    """Plan the move from where the demand is to rest at the target [rad], or to rest alone where it must stop first."""
+    """Plan the move from the present demand to rest at the target [rad], or only to rest if it must stop first."""
     x, v, shape = drive.position_demand[lane], drive.velocity_demand[lane], drive.profile_shape[lane]
     rises, falls = curve_of(shape, True), curve_of(shape, False)
     sign = 1.0 if target > x or (target == x and v > 0.0) else -1.0
     distance, u = sign * (target - x), sign * v
     alpha, m = slope(rises) / up, area(rises)
     per_speed = slope(falls) / down
-    beta = per_speed * (1.0 - area(falls))  # rad per (rad/s)^2 of coming to rest
+    beta = per_speed * (1.0 - area(falls))  # rad per (rad/s)^2 of stopping distance
     w, up_time, way = u, 0.0, 0.0
     if u > v_max:
         w, up_time = v_max, per_speed * (u - v_max)
@@ -134,7 +134,7 @@ def _at(drive, lane):
     left = up + cruise + down - t
     if left <= 0.0:
         return plan[END, lane], 0.0, 0.0
-    # From the end backwards: the target is met exactly, whatever the sums before it have rounded.
+    # Backwards from the end: the target is reached exactly, despite rounding of the sums.
     falls = curve_of(shape, False)
     stop = w * down * (1.0 - area(falls))
     if left >= down:
@@ -146,14 +146,14 @@ def _at(drive, lane):
 
 @stage
 def _holds(drive, lane, target, v_max, up, down):
-    """Return whether the plan is still the one for this target and these limits, and the demand where it has it."""
+    """Return whether the plan still fits this target, these limits, and the present demand."""
     plan = drive.plan
     if plan[ACTIVE, lane] == 0.0 or plan[SHAPE, lane] != drive.profile_shape[lane]:
         return False
     if plan[TARGET, lane] != target or plan[DOWN, lane] != down:
         return False
     x, v, _ = _at(drive, lane)
-    # Once it comes to rest, a speed that it is below of already and an acceleration change nothing.
+    # Once it comes to rest, a speed limit above its present speed, or another acceleration, changes nothing.
     comes_to_rest = plan[TIME, lane] >= plan[UP_TIME, lane] + plan[CRUISE_TIME, lane] and abs(v) <= v_max
     if not comes_to_rest and (plan[MOST_SPEED, lane] != v_max or plan[UP, lane] != up):
         return False
@@ -168,7 +168,7 @@ def advance(drive, lane, target, v_max, up, down, dt):
 
     Args:
         drive: The record.
-        lane: Of the axis.
+        lane: Lane of the axis.
         target: Where the move ends [rad].
         v_max: Largest speed, positive [rad/s]; an axis that is faster brakes to it first.
         up: Greatest acceleration, positive [rad/s^2].

@@ -7,18 +7,18 @@ r"""The six-point ramp: a trapezoid that begins and ends with a jump, and has ot
     start      |            | end       jumped from, or left by stop_deceleration
     ____________________________ time   ramp_wait passes before the next motion
 
-As the motion controllers of Trinamic have it (TMC5130 data sheet, "ramp generator"): velocity_1 = 0 leaves one ramp for
-each way, start_velocity and end_velocity are jumped to and from, and after a stop the axis waits. Where there is a
-stop_deceleration (TMCM-3313 manual, section 4.2.15) the end velocity is where that ramp takes over. It is exact within
-a period: the times at which one ramp goes over into the next are found, not sampled.
+As in Trinamic's motion controllers (TMC5130 data sheet, "ramp generator"): with velocity_1 = 0 there is one ramp per
+direction, the speed jumps to start_velocity and from end_velocity, and after a stop the axis waits. With a
+stop_deceleration (TMCM-3313 manual, section 4.2.15) that ramp takes over at the end velocity. The ramp is exact within
+a period: the times at which one part ends are computed, not sampled.
 """
 
 from __future__ import annotations
 
 from mechanics.kernels.compiled import stage
 
-MOST_PARTS = 12  # of a ramp, within one period: reversed on the way, braked, waited for, and begun anew
-NEAR = 1e-9  # rad: at the target but for rounding
+MOST_PARTS = 12  # of a ramp within one period: reversal, braking, waiting, and a new start
+NEAR = 1e-9  # rad: at the target except for rounding
 
 
 @stage
@@ -34,19 +34,19 @@ def is_set(drive, lane):
 
 @stage
 def slow_ramp(ramp, above):
-    """Return the ramp below velocity_1, where 0 stands for the one above it."""
+    """Return the ramp below velocity_1; 0 means the one above it."""
     return ramp if ramp > 0.0 else above
 
 
 @stage
 def last_speed(drive, lane):
-    """Return the speed [rad/s] that a ramp jumps from to rest: the end velocity, unless a ramp of its own ends it."""
+    """Return the speed [rad/s] that a ramp jumps from to rest: the end velocity, unless a separate ramp ends it."""
     return 0.0 if drive.stop_deceleration[lane] > 0.0 else drive.end_velocity[lane]
 
 
 @stage
 def braking_constants(drive, lane, u, down):
-    """Return D and c of the way u^2 / (2 D) + c that braking takes from a speed u [rad/s] on its part of the ramp."""
+    """Return D and c of the braking distance u^2 / (2 D) + c from a speed u [rad/s] on its part of the ramp."""
     low, end, stop = drive.velocity_1[lane], drive.end_velocity[lane], drive.stop_deceleration[lane]
     if stop > 0.0 and u < end:
         return stop, 0.0
@@ -61,7 +61,7 @@ def braking_constants(drive, lane, u, down):
 
 @stage
 def braking_way(drive, lane, u, down):
-    """Return the way [rad] from a speed u [rad/s], 0 or more, down to rest or to what is jumped from."""
+    """Return the distance [rad] from a speed u [rad/s], 0 or more, to rest or to the speed that jumps to rest."""
     if u <= last_speed(drive, lane):
         return 0.0
     D, c = braking_constants(drive, lane, u, down)
@@ -70,15 +70,15 @@ def braking_way(drive, lane, u, down):
 
 @stage
 def slow_down(drive, lane, u, floor, down, left):
-    """Return speed, way and time of one part of a braking: to the part's end or a floor in it, in `left` [s] at most.
+    """Return speed, distance and time of one part of a braking: to the part's end or a floor, in `left` [s] at most.
 
     Args:
         drive: The record.
-        lane: Of the axis.
+        lane: Lane of the axis.
         u: Speed [rad/s], above the floor.
-        floor: Where it ends [rad/s].
+        floor: Speed at which it ends [rad/s].
         down: Deceleration above velocity_1 [rad/s^2].
-        left: Time that there is [s].
+        left: Available time [s].
     """
     low, stop_from = drive.velocity_1[lane], drive.end_velocity[lane]
     if drive.stop_deceleration[lane] > 0.0 and u <= stop_from:
@@ -95,17 +95,17 @@ def slow_down(drive, lane, u, floor, down, left):
 
 @stage
 def go_on(drive, lane, u, distance, v_max, up, down, left):
-    """Return speed, way and time of one part of the way to the target: speeding up or even, in `left` [s] at most.
+    """Return speed, distance and time of one part of the move: speeding up or constant, in `left` [s] at most.
 
     Args:
         drive: The record.
-        lane: Of the axis.
+        lane: Lane of the axis.
         u: Speed [rad/s], v_max at most.
-        distance: To the target [rad], more than braking takes.
+        distance: Distance to the target [rad], more than the braking distance.
         v_max: Largest speed [rad/s].
         up: Acceleration above velocity_1 [rad/s^2].
         down: Deceleration above it [rad/s^2].
-        left: Time that there is [s].
+        left: Available time [s].
     """
     if u >= v_max:
         t = min((distance - braking_way(drive, lane, u, down)) / u, left)
@@ -133,7 +133,7 @@ def advance(drive, lane, target, v_max, up, down, dt):
 
     Args:
         drive: The record.
-        lane: Of the axis.
+        lane: Lane of the axis.
         target: Where the move ends [rad].
         v_max: Largest speed, positive [rad/s]; an axis that is faster brakes to it first.
         up: Acceleration above velocity_1, positive [rad/s^2].
@@ -155,13 +155,13 @@ def advance(drive, lane, target, v_max, up, down, dt):
             if distance <= 10.0 * NEAR:
                 x = target
                 continue
-            # A way on which it could not be braked from begins at rest.
+            # A distance too short for braking from that speed begins at rest.
             start = min(drive.start_velocity[lane], v_max)
             u = start if braking_way(drive, lane, start, down) <= distance else 0.0
         floor = last_speed(drive, lane)
         brakes = u < 0.0 or distance <= braking_way(drive, lane, u, down) + NEAR
         if brakes and abs(u) <= floor + NEAR:
-            # The last speed is jumped from; away from the target the axis turns round.
+            # The speed jumps from the last speed to rest; away from the target the axis reverses.
             x, v = (target if distance <= 10.0 * NEAR else x), 0.0
             drive.ramp_wait_left[lane] = drive.ramp_wait[lane]
             continue
@@ -170,7 +170,7 @@ def advance(drive, lane, target, v_max, up, down, dt):
         if u < 0.0:
             speed, way, t = slow_down(drive, lane, -u, floor, down, left)
             x, v = x - sign * way, -sign * speed
-            if v == 0.0:  # before it turns round, too (TMC5130 data sheet, TZEROWAIT)
+            if v == 0.0:  # also before it reverses (TMC5130 data sheet, TZEROWAIT)
                 drive.ramp_wait_left[lane] = drive.ramp_wait[lane]
         elif brakes:
             speed, way, t = slow_down(drive, lane, u, floor, down, left)

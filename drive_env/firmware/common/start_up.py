@@ -1,4 +1,4 @@
-"""States of a motor's start-up: what must be found out before the modes may move it, such as the rotor's angle."""
+"""States of a motor's start-up: preparations before the modes may move it, such as finding the rotor's angle."""
 
 from __future__ import annotations
 
@@ -9,5 +9,5 @@ NEEDED, FIRST_ANGLE, SECOND_ANGLE, DONE, FAILED = 0, 1, 2, 3, 4
 
 @stage
 def is_busy(drive, lane):
-    """Return whether the start-up turns the motor, so that the mode has to wait."""
+    """Return whether the start-up turns the motor, so that the mode must wait."""
     return drive.init_state[lane] == FIRST_ANGLE or drive.init_state[lane] == SECOND_ANGLE

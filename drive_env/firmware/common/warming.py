@@ -1,4 +1,4 @@
-"""What warms: fields of winding and stage, and how copper and magnets follow the winding's temperature."""
+"""Temperatures: fields of winding and stage, and the winding's resistance and flux as functions of its temperature."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from drive_env.firmware.record import Field
 from drive_env.motors import COPPER
 from mechanics.kernels.compiled import inlined
 
-NOMINAL = 25.0  # degC at which the motor's row holds
+NOMINAL = 25.0  # degC of the motor's data
 
 PARAMETERS = (
     Field("on_resistance", "f8", "ohm", "of the stage, in a phase's path"),
@@ -27,7 +27,7 @@ STATE = (Field("T_winding", "f8", "K", "winding temperature above 0 degC", 25.0)
 
 @inlined
 def warmed(drive, lane, loss, stage_loss, dt):
-    """Move both temperatures on by dt [s], first-order models to ambient, with losses [W]; writes R_s and psi_m."""
+    """Advance both temperatures by dt [s], first-order models to ambient, with losses [W]; writes R_s and psi_m."""
     T = drive.T_winding[lane]
     rise = drive.ambient[lane] + loss * drive.thermal_resistance[lane] - T
     T += rise * dt / drive.thermal_time[lane]

@@ -1,8 +1,8 @@
 """Commutation: which angle the current loop uses, and how the encoder is aligned with the rotor (2055h, 2080h:03).
 
-Estimate offset holds a current along one angle, then a quarter electrical turn further: the rotor must follow, and in
-the direction in which the encoder counts. Use hall takes the middle of the sector, half a sector off at most. Use
-offset knows the alignment from before.
+"Estimate offset" holds a current along one angle, then a quarter electrical turn further: the rotor must follow in the
+counting direction of the encoder. "Use hall" takes the middle of the sector, with an error of at most half a sector.
+"Use offset" uses a stored alignment.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ VELOCITY_BY_HALL = 1.0  # 2042h:05
 
 HOLD_TIME = 0.4  # s at each angle: the rotor swings in
 LONGEST_HOLD = 3.0  # s after which the angle is taken even if it still swings
-TOLERANCE = 0.3  # of a quarter turn, by which its motion may differ
+TOLERANCE = 0.3  # of a quarter turn, by which the rotor's motion may differ
 
 
 @stage
@@ -33,7 +33,7 @@ def _encoder_turn(drive, lane):
 
 @stage
 def has_come_to_rest(drive, lane):
-    """Return whether the held rotor stands, or has had time enough."""
+    """Return whether the held rotor stands, or LONGEST_HOLD has passed."""
     return abs(drive.omega_slow[lane]) <= 0.25 * drive.standstill[lane] or drive.init_time[lane] > LONGEST_HOLD
 
 
@@ -46,7 +46,7 @@ def commutate(drive, lane, dt):
     mode = drive.commutation_mode[lane]
     if drive.motor_type[lane] == DC:
         drive.angle_source[lane] = DC_FRAME
-        # A stage set for two legs does not drive three phases, nor the reverse.
+        # A stage configured for two legs does not drive three phases, and vice versa.
         drive.stage_on[lane] = 1.0 if on and drive.is_dc[lane] == 1.0 else 0.0
         drive.init_state[lane] = DONE
         return
@@ -82,14 +82,14 @@ def commutate(drive, lane, dt):
     drive.i_d_ref[lane] = min(current, drive.i_max[lane])
     drive.init_time[lane] += dt
     if drive.init_state[lane] == FIRST_ANGLE:
-        # Swept to the first angle, or a rotor exactly opposite would stay where it is.
+        # The current sweeps to the first angle: a rotor exactly opposite would not move.
         drive.angle_forced[lane] = QUARTER * (min(2.0 * drive.init_time[lane] / HOLD_TIME, 1.0) - 1.0)
         if drive.init_time[lane] >= HOLD_TIME and has_come_to_rest(drive, lane):
             drive.init_angle[lane] = _encoder_turn(drive, lane)
             drive.init_state[lane] = SECOND_ANGLE
             drive.init_time[lane] = 0.0
         return
-    # Turned there step by step, or a rotor on the far side would fall to either hand.
+    # Turned there step by step: a rotor on the opposite side could fall to either side.
     drive.angle_forced[lane] = QUARTER * min(2.0 * drive.init_time[lane] / HOLD_TIME, 1.0)
     if drive.init_time[lane] < 2.0 * HOLD_TIME or not has_come_to_rest(drive, lane):
         return
@@ -103,7 +103,7 @@ def commutate(drive, lane, dt):
 
 @stage
 def needs_halls(drive, lane):
-    """Return whether the halls tell the angle or the velocity, or have to at the initialisation of the encoder."""
+    """Return whether angle, velocity, or the initialisation of the encoder use the halls."""
     return (
         drive.angle_source[lane] == HALL
         or drive.velocity_sensor[lane] == VELOCITY_BY_HALL

@@ -1,4 +1,4 @@
-"""What servo drives watch: the shared causes, and those of bridge, phases, halls and the encoder's start-up."""
+"""Causes of servo drives: the shared ones, and those of bridge, phases, halls and the encoder's start-up."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ from drive_env.firmware.common.protection import CUT, FAULT_RESET, FOLLOWING_ERR
 from drive_env.firmware.servo import alignment
 from mechanics.kernels.compiled import stage
 
-OPEN_LOAD_DEMAND = 1.0  # A of phase current that must be asked for
-OPEN_LOAD_CURRENT = 0.3  # A below which there is none
+OPEN_LOAD_DEMAND = 1.0  # A of phase current that must be demanded
+OPEN_LOAD_CURRENT = 0.3  # A below which a phase counts as without current
 SQRT3 = 3.0**0.5
 
 
 @stage
 def watch_phases(drive, lane, dt):
     """Measure for how long a phase carries no current although the loop asks for it."""
-    # What each phase should carry now; a rotor at rest may well ask nothing of one of them.
+    # The present demand of each phase; for a rotor at rest that of one phase may be 0.
     q = drive.i_q_ref[lane] * drive.torque_share[lane] * (1.0 - 2.0 * drive.shaft_direction[lane])
     d = drive.i_d_ref[lane]
     alpha = drive.cos_meas[lane] * d - drive.sin_meas[lane] * q
     beta = drive.sin_meas[lane] * d + drive.cos_meas[lane] * q
     asked_a = abs(alpha)
     asked_b = asked_a if drive.is_dc[lane] == 1.0 else abs(0.5 * (SQRT3 * beta - alpha))
-    # Near no-load speed no current flows for want of voltage: the other phase, or standstill, must show that it could.
+    # Near no-load speed no current flows for lack of voltage: the other phase, or standstill, must show that it could.
     stands = abs(drive.omega_slow[lane]) <= drive.standstill[lane]
     on = drive.stage_on[lane] > 0.0
     could_a = on and asked_a > OPEN_LOAD_DEMAND and (stands or drive.peak_b[lane] >= OPEN_LOAD_CURRENT)
@@ -58,8 +58,8 @@ def overcurrent_b(drive, lane, told):
 
 @stage
 def hall_error(drive, lane, told):
-    """Return whether halls are needed that tell nothing: all three lines alike is a pattern that no rotor gives."""
-    # A brushed motor has none.
+    """Return whether needed halls are invalid: all three lines are equal, which no rotor causes."""
+    # A brushed motor has no halls.
     return (drive.hall_broken[lane] > 0.0 or drive.is_dc[lane] == 1.0) and alignment.needs_halls(drive, lane)
 
 
@@ -87,7 +87,7 @@ CAUSES = (
     Cause("hall_error", CUT, 0x20, 0x20, hall_error),
     Cause("shutdown_switch", CUT, 0x80, 0x1000, causes.shutdown_switch),
     Cause("encoder_initialization", CUT, 0x20, 0x80, initialization_failed, tried_again=True),
-    # With one phase open the other lacks current too while the rotor stands across it: that follows from the first.
+    # With one phase open the other also lacks current while the rotor stands across it: a consequence of the first.
     Cause("open_load_a", STOP, 0x80, 0x40, open_load_a, held=True, unless="open_load_b"),
     Cause("open_load_b", STOP, 0x80, 0x40, open_load_b, held=True, unless="open_load_a"),
     Cause(FOLLOWING_ERROR, STOP, 0x20, 0x0, causes.following_error),

@@ -1,4 +1,4 @@
-"""What the stages of servo drives have in the record beside what every drive has."""
+"""Fields of servo drives in the record, in addition to those of all drives."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ def motion_loops(drive):
         total = clip(drive.velocity_sum[lane] + proportional * drive.velocity_i[lane], i_max)
         i_loop = clip(proportional + total, i_max)
         i_direct = clip(drive.torque_demand[lane], i_max)
-        # While torque is commanded the integrator follows it, or a change to a velocity mode would jump.
+        # While torque is commanded the integrator follows it, otherwise a change to a velocity mode would jump.
         total = clip(i_direct - proportional, i_max) if level == 0 else total
         i_ref = i_direct if level == 0 else i_loop
         on = drive.drive_function[lane]
@@ -47,7 +47,7 @@ def current_loop(drive):
         shaft_sign = 1.0 - 2.0 * drive.shaft_direction[lane]
         error_q = shaft_sign * drive.torque_share[lane] * drive.i_q_ref[lane] - i_q
         on = drive.stage_on[lane]
-        # Between two legs lies the whole supply, not the voltage circle.
+        # Two legs have the whole supply between them, not the voltage circle.
         limit = 1.0 if drive.angle_source[lane] == 5.0 else drive.duty_limit[lane]
         p_d = drive.current_p_d[lane] * error_d
         p_q = drive.current_p[lane] * error_q
@@ -67,6 +67,6 @@ def current_loop(drive):
         drive.current_error_q[lane] = error_q
         drive.current_sum_d[lane] = sum_d
         drive.current_sum_q[lane] = sum_q
-        # Computed from this tick's samples, held by the bridge during the next: one PWM period of delay.
+        # Computed from this tick's samples, applied by the bridge during the next: one PWM period of delay.
         drive.duty_next_alpha[lane] = c * duty_d - s * duty_q
         drive.duty_next_beta[lane] = s * duty_d + c * duty_q

@@ -5,9 +5,10 @@ The bridge holds a voltage in the stator frame. In the rotor frame, at constant 
     di/dt = A i + B u + e      A = [[-R/L_d,  w L_q/L_d], [-w L_d/L_q, -R/L_q]],  B = diag(1/L_d, 1/L_q)
     du/dt = W u                W = [[0, w], [-w, 0]],  e = [0, -w psi/L_q]
 
-where R is that of winding and stage: a phase's current flows through one switch of its leg, a DC motor's through one of
-either leg. So one tick is i(dt) = exp(A dt) i + G u + g with G the solution of A G - G W = exp(A dt) B - B exp(W dt).
-The matrices change with speed only and are refreshed once per window. A DC motor is the q axis of a frame at rest.
+where R is that of winding and stage: a phase's current flows through one switch of its leg, a DC motor's through one
+switch of each leg. So one tick is i(dt) = exp(A dt) i + G u + g with G the solution of A G - G W = exp(A dt) B - B
+exp(W dt). The matrices depend only on speed and are refreshed once per window. A DC motor is the q axis of a frame at
+rest.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ def refresh_winding(drive, dt, h):
         L_q = drive.L_q[lane]
         acceleration = (drive.tau_m[lane] + drive.tau_cogging[lane] - drive.tau_reaction[lane]) / drive.J_rotor[lane]
         omega_e = drive.n_p[lane] * (drive.omega_m[lane] + 0.5 * h * acceleration)
-        # A DC motor's frame does not turn, its back-EMF is there all the same.
+        # A DC motor's frame does not turn, but its back-EMF is present.
         w = omega_e * (1.0 - drive.is_dc[lane])
         a_dd = -R / L_d
         a_qq = -R / L_q
@@ -137,7 +138,7 @@ def power_stage(drive):
         lost_b = clip(0.5 * (SQRT3 * i_beta - i_alpha) * per_ampere, 1.0)
         lost_c = clip(-0.5 * (SQRT3 * i_beta + i_alpha) * per_ampere, 1.0)
         is_dc = drive.is_dc[lane]
-        # A DC motor lies between two legs: each loses its share, and there is no beta.
+        # A DC motor is between two legs: each has a loss, and there is no beta.
         lost_alpha = lost * (2.0 * lost_a if is_dc > 0.5 else (1.0 / 3.0) * (2.0 * lost_a - lost_b - lost_c))
         u_alpha = drive.duty_alpha[lane] * u_dc - lost_alpha
         u_beta = (drive.duty_beta[lane] * u_dc - lost * (1.0 / SQRT3) * (lost_b - lost_c)) * (1.0 - is_dc)
@@ -186,7 +187,7 @@ def power_stage(drive):
 
 @inlined
 def open_phases(drive):
-    """Take out the current along a phase whose cable is broken."""
+    """Remove the current along a phase with a broken cable."""
     for lane in range(LANES):
         s = drive.sin_e[lane]
         c = drive.cos_e[lane]
@@ -225,7 +226,7 @@ def open_phases(drive):
 
 @inlined
 def find_torque(drive, lane):
-    """Turn the tick's mean currents into torque and power: writes tau_m and bridge_power."""
+    """Compute torque and power from the tick's mean currents: writes tau_m and bridge_power."""
     mean_d = drive.i_d_mean[lane]
     mean_q = drive.i_q_mean[lane]
     change = (drive.i_d[lane] - drive.i_d_before[lane]) * (drive.i_q[lane] - drive.i_q_before[lane])
@@ -236,7 +237,7 @@ def find_torque(drive, lane):
         * drive.n_p[lane]
         * (drive.psi_m[lane] * mean_q + (drive.L_d[lane] - drive.L_q[lane]) * mean_dq)
     )
-    # The held voltage, as the rotor frame sees it in the middle of the tick, times the mean current.
+    # The held voltage in the rotor frame in the middle of the tick, times the mean current.
     half_s = drive.half_turn_sin[lane]
     half_c = drive.half_turn_cos[lane]
     mid_d = half_c * drive.u_d[lane] + half_s * drive.u_q[lane]
@@ -246,14 +247,14 @@ def find_torque(drive, lane):
 
 @inlined
 def convert_energy(drive, dt, progress):
-    """Turn the tick's mean currents into torque and supply current: writes tau_m, u_dc, and moves the rotor on.
+    """Compute torque and supply current from the tick's mean currents: writes tau_m, u_dc, and advances the rotor.
 
-    Ticks are of dt [s]; `progress` is that of `turn_rotor`.
+    Ticks take dt [s]; `progress` is that of `turn_rotor`.
     """
     for lane in range(LANES):
         find_torque(drive, lane)
         u_dc = drive.u_dc[lane]
-        # What braking charges the link with the chopper alone takes away.
+        # Charge by braking is removed only by the chopper.
         limit = drive.chopper_voltage[lane]
         chopper = drive.chopper[lane]
         chopper = 0.0 if u_dc < limit - drive.chopper_hysteresis[lane] else chopper

@@ -12,8 +12,8 @@ from mechanics.kernels.compiled import inlined, stage
 
 SQRT3 = 3.0**0.5
 PI = 3.141592653589793
-HALL_STANDSTILL = 0.05  # s without an edge after which the halls tell no speed
-HALL_UNKNOWN = 1.0  # s between edges, for "not known": beyond standstill
+HALL_STANDSTILL = 0.05  # s without an edge after which the halls' speed is 0
+HALL_UNKNOWN = 1.0  # s between edges, meaning unknown: beyond standstill
 
 
 @inlined
@@ -28,8 +28,8 @@ def measure_motion(drive, h):
         before = drive.count[lane]
         shaft = 1.0 - 2.0 * drive.shaft_direction[lane]
         per_count = shaft * TWO_PI * drive.turns_per_count[lane]
-        # Under hall commutation the halls are the encoder, unless 2043h:03 says otherwise: 6 steps per pole pair, speed
-        # from the time between edges. All is computed and then chosen: a branch would cost the loop its vectors.
+        # With hall commutation the halls are the encoder, unless 2043h:03 says otherwise: 6 steps per pole pair, speed
+        # from the time between edges. All is computed and then selected: a branch would prevent vectorisation.
         per_sector = shaft * (PI / 3.0) / drive.pole_pairs[lane]
         elapsed = drive.hall_time[lane]
         period = drive.hall_period[lane]
@@ -63,7 +63,7 @@ def measure_halls(drive, dt):
         elapsed = drive.hall_time[lane] + dt
         edge = change != 0.0
         sense = (1.0 if change > 0.0 else -1.0) if edge else drive.hall_sense[lane]
-        # An edge that is crossed back ends no sector: how fast the rotor is, the next one tells.
+        # An edge that is crossed back ends no sector: the next one gives the rotor's speed.
         back = sense * drive.hall_sense[lane] < 0.0
         period = (HALL_UNKNOWN if back else elapsed) if edge else drive.hall_period[lane]
         elapsed = 0.0 if edge else elapsed
@@ -112,7 +112,7 @@ def measure_currents(drive):
         i_beta = s * drive.i_d[lane] + c * drive.i_q[lane]
         i_a = i_alpha
         i_b = -i_alpha if drive.is_dc[lane] > 0.5 else 0.5 * (SQRT3 * i_beta - i_alpha)
-        # Two words of xorshift32, four bytes each: a sum of four is close enough to a normal deviate.
+        # Two words of xorshift32, four bytes each: a sum of four is sufficiently close to a normal deviate.
         x = U32(drive.random[lane])
         x = U32(x ^ U32(x << U32(13)))
         x = U32(x ^ U32(x >> U32(17)))
@@ -159,6 +159,6 @@ ADC_CENTRE = 33500.0
 
 @stage
 def tell_counts(drive, lane):
-    """Write the counts of a revolution of the sensor that tells the position: the halls, or the encoder."""
+    """Write the counts per revolution of the position sensor: the halls, or the encoder."""
     by_hall = drive.angle_source[lane] == 2.0 and drive.always_use_encoder[lane] == 0.0
     drive.counts_per_turn[lane] = 6.0 * drive.pole_pairs[lane] if by_hall else drive.encoder_steps[lane]

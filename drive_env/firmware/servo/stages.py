@@ -1,4 +1,4 @@
-"""The firmware of servo drives: which stages run when."""
+"""The firmware of servo drives: the order of its stages."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ def collect_torque(drive, s, weight, moment):
 
 
 def tick_with(convert: Stage) -> Stage:
-    """Return the stage that runs the current loop once, with what turns a tick's currents into energy and motion."""
+    """Return the stage that runs the current loop once, with `convert` for a tick's energy and motion."""
 
     @stage
     def run_tick(drive, rates, k):
         """Run the current loop once: sensors, regulation, bridge and winding, torque for the load's next steps.
 
-        One stage, since a call between two of them takes some nanoseconds, 25,000 times a second.
+        One stage, since each call takes some nanoseconds, 25,000 times a second.
         """
         if drive.block_uses_halls[0]:
             measure_halls(drive, rates.tick)
@@ -55,7 +55,7 @@ def tick_with(convert: Stage) -> Stage:
 
 @stage
 def read_motion(drive, rates):
-    """Read encoder, and halls where they are needed no more often."""
+    """Read the encoder, and the halls if once per window suffices."""
     if not drive.block_uses_halls[0]:
         measure_halls(drive, rates.window)
     if drive.block_has_noisy_encoder[0]:
@@ -73,7 +73,7 @@ def regulate_motion(drive, rates):
 
 @stage
 def prepare_winding(drive, rates):
-    """Find this window's cogging torque, and the winding's matrices for its ticks."""
+    """Compute this window's cogging torque, and the winding's matrices for its ticks."""
     for lane in range(LANES):
         s, _ = sine_cosine(drive.cogging_order[lane] * drive.theta_m[lane] + drive.cogging_phase[lane])
         drive.tau_cogging[lane] = drive.cogging_torque[lane] * s
@@ -86,19 +86,19 @@ def prepare_winding(drive, rates):
 
 @stage
 def warm(drive, rates):
-    """Move temperatures on."""
+    """Advance the temperatures."""
     thermal.warm(drive, rates.period)
 
 
 @stage
 def prepare_quotients(drive, rates):
-    """Compute what the ticks need as quotients."""
+    """Compute the quotients for the ticks."""
     derive(drive, rates.tick)
 
 
 @stage
 def find_what_is_needed(drive, rates):
-    """Leave what few drives need out of the ticks of a block where none does."""
+    """Find rarely used parts of the ticks that no drive of a block needs."""
     find_whether_index_is_needed(drive)
     drive.block_uses_halls[0] = 0
     drive.block_has_open_phase[0] = 0
@@ -118,7 +118,7 @@ def tell_sensor(drive, lane, dt):
 
 @stage
 def halt(drive, lane):
-    """Leave no number behind that is none."""
+    """Replace non-finite state by 0."""
     forget_velocity(drive, lane)
     drive.current_sum_d[lane] = 0.0
     drive.current_sum_q[lane] = 0.0
@@ -128,7 +128,7 @@ def halt(drive, lane):
 
 @stage
 def power_on(drive, lane):
-    """Begin loops and sensors anew: the angle at which the rotor stands is known up to the commutation offset."""
+    """Reset loops and sensors: the rotor's angle is known up to the commutation offset."""
     drive.overload[lane] = 0.0
     drive.i_d[lane] = 0.0
     drive.i_q[lane] = 0.0

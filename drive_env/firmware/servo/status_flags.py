@@ -6,19 +6,19 @@ from drive_env import cia402
 from drive_env.firmware.common import fsa, start_up
 from mechanics.kernels.compiled import stage
 
-# Bits of 2101h (table 85); those of the faults are the protection's.
+# Bits of 2101h (table 85); the faults' bits are set by the protection.
 FLAG_HALTED, FLAG_STOP, FLAG_VELOCITY, FLAG_POSITION, FLAG_TORQUE = 1 << 4, 1 << 8, 1 << 9, 1 << 10, 1 << 11
 FLAG_POSITION_END, FLAG_INITIALIZED, FLAG_BRAKE = 1 << 14, 1 << 15, 1 << 18
 
 
 @stage
 def tell_status(drive, lane):
-    """Write 2101h: what the motor does, and the flags of the causes that hold."""
+    """Write 2101h: the motor's state, and the flags of present causes."""
     flags = FLAG_INITIALIZED if drive.fsa[lane] != fsa.NOT_READY else 0
     if abs(drive.omega_slow[lane]) <= drive.standstill[lane]:
         flags |= FLAG_HALTED
     stops = drive.drive_function[lane] == 0.0 or drive.stopping[lane] == 1 or drive.braking[lane] == 1
-    # While the encoder is aligned the motor is in none of its modes.
+    # While the encoder is aligned the motor is not in any mode.
     if stops or start_up.is_busy(drive, lane):
         flags |= FLAG_STOP
     elif drive.loop_level[lane] == 2.0:

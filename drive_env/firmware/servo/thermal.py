@@ -11,10 +11,10 @@ LARGEST_SQUARE = 1e12  # A^2
 
 @inlined
 def warm(drive, dt):
-    """Move both temperatures on by dt [s], first-order models to ambient; writes R_s and psi_m."""
+    """Advance both temperatures by dt [s], first-order models to ambient; writes R_s and psi_m."""
     for lane in range(LANES):
         square = drive.i_d[lane] * drive.i_d[lane] + drive.i_q[lane] * drive.i_q[lane]
-        square = square if square < LARGEST_SQUARE else 0.0  # a frozen lane's currents may be no numbers
+        square = square if square < LARGEST_SQUARE else 0.0  # a frozen lane's currents may be non-finite
         factor = drive.phase_factor[lane]
         loss = factor * drive.R_s[lane] * square
         in_stage = factor * (1.0 + drive.is_dc[lane]) * drive.on_resistance[lane] * square  # in both legs of a DC motor

@@ -1,4 +1,4 @@
-"""The stages of two-axis servo amplifiers on mains: a DC link that axes share, a gate for the master, shaped ramps."""
+"""The stages of two-axis servo amplifiers on mains: a DC link shared by axes, a gate for the master, shaped ramps."""
 
-MOTOR_KINDS = ("pmsm",)  # of motors/, that it turns
+MOTOR_KINDS = ("pmsm",)  # of motors/, supported by these stages
 DEFAULT_MOTOR = "am3041_e"

@@ -1,8 +1,8 @@
-"""What two-axis servo amplifiers on mains watch: the errors of the TGZ manual's table, by their physical cause.
+"""Causes of two-axis servo amplifiers on mains: the errors of the TGZ manual's table, by their physical cause.
 
-A cause's status flag is its bit of the error register. Of two errors the maker tells nothing that a machine could have:
-2 is an "internal hardware error" of no told kind, and of 18 there is a name alone. A machine sets them: error_bits does
-it for every error of the table.
+A cause's status flag is its bit of the error register. Two errors have no documented physical cause: 2 is an
+unspecified "internal hardware error", and 18 has only a name. They occur only if a machine sets them by error_bits, as
+it can set every error.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from drive_env.firmware.servo.causes import overcurrent_high_side as overcurrent
 from drive_env.firmware.servo_mains.mains_link import owner
 from mechanics.kernels.compiled import inlined, stage
 
-REVERSE_TIME = 0.01  # s of speeding up against the current, after which the commutation is wrong
-REVERSE_SHARE = 0.5  # of the current's limit, that must be asked for
-OFF_TIME = 0.02  # s after which a stage that is off has no current: several times a winding's L/R
-STUCK_TIME = 0.1  # s of standing still under a brake that should be open
-SWITCH_TIME = 0.2  # s in which a brake must have followed its output, by its switch: several times what it needs
+REVERSE_TIME = 0.01  # s of accelerating against the current, after which the commutation is wrong
+REVERSE_SHARE = 0.5  # of the current's limit, that must be demanded
+OFF_TIME = 0.02  # s after which a switched-off stage has no current: several times a winding's L/R
+STUCK_TIME = 0.1  # s of standstill under a brake that should be open
+SWITCH_TIME = 0.2  # s in which the brake's switch must follow its output: several times the brake's time
 BRAKE_SUPPLY = 21.6  # V: 24 V less 10 %, what holding brakes are specified for
 # Bits of 1001h (TGZ manual): current, voltage, temperature, communication.
 CURRENT, VOLTAGE, TEMPERATURE, NETWORK = 0x02, 0x04, 0x08, 0x10
@@ -43,29 +43,29 @@ CURRENT, VOLTAGE, TEMPERATURE, NETWORK = 0x02, 0x04, 0x08, 0x10
 
 @stage
 def watch_motion(drive, lane, dt):
-    """Measure for how long each cause of a fault has held: no power, following error, runaway, brake, its switch."""
+    """Measure how long causes of faults have been present: no power, following error, runaway, brake, its switch."""
     drive.off_time[lane] = 0.0 if drive.stage_on[lane] > 0.0 else drive.off_time[lane] + dt
     window = drive.following_error_window[lane]
     error = abs(drive.position_demand[lane] - drive.theta_meas[lane])
     follows = drive.drive_function[lane] > 0.0 and window > 0.0 and drive.loop_level[lane] > 0.0
     drive.following_time[lane] = drive.following_time[lane] + dt if follows and error > window else 0.0
-    # The mean of the period: of a current that oscillates faster, single values are whatever moment they are of.
+    # The mean of the period: single values of a current that oscillates faster are arbitrary.
     asked = drive.asked_mean[lane]
     drive.asked_mean[lane] = 0.0
     most = REVERSE_SHARE * (drive.i_high[lane] if asked > 0.0 else -drive.i_low[lane])
     omega, slow = drive.omega_meas[lane], drive.omega_slow[lane]
-    # It gains speed against the current. One that oscillates has it against the current, too, and loses it then.
+    # It gains speed against the current. An oscillating axis also does, but loses the speed again.
     gained = omega - drive.omega_before[lane]
     drive.omega_before[lane] = omega
     runs_away = (
         drive.stage_on[lane] > 0.0
-        and drive.torque_share[lane] > 0.0  # in open loop the current is not asked to turn anything
+        and drive.torque_share[lane] > 0.0  # in open loop the current is not demanded for torque
         and abs(asked) > most
         and asked * omega < 0.0
         and asked * gained < 0.0
         and abs(omega) > drive.standstill[lane]
     )
-    # All the time one way: with the other sign of the current it begins anew.
+    # All the time in one direction: it restarts at another sign of the current.
     way = 1.0 if asked > 0.0 else -1.0
     so_far = way * drive.reverse_time[lane]
     drive.reverse_time[lane] = way * ((so_far if so_far > 0.0 else 0.0) + dt) if runs_away else 0.0
@@ -92,13 +92,13 @@ def mains_phase(drive, lane, told):
 
 @stage
 def mains_supply(drive, lane, told):
-    """Return whether the mains are too low to charge the link."""
+    """Return whether the mains voltage is too low to charge the link."""
     return drive.supply_voltage[owner(drive, lane)] < drive.undervoltage[lane]
 
 
 @stage
 def holding_brake(drive, lane, told):
-    """Return whether the brake holds a motor that it should have let go."""
+    """Return whether the brake holds a motor that it should have released."""
     return drive.stuck_time[lane] > STUCK_TIME
 
 
@@ -110,21 +110,21 @@ def holding_brake_switch(drive, lane, told):
 
 @stage
 def current_measurement(drive, lane, told):
-    """Return whether a current is measured although the stage is off, and what flowed before has ended."""
+    """Return whether a current is measured although the stage has been off for OFF_TIME."""
     peak = max(drive.peak_a[lane], drive.peak_b[lane])
     return drive.off_time[lane] > OFF_TIME and peak > drive.offset_limit[lane]
 
 
 @stage
 def motor_thermostat(drive, lane, told):
-    """Return whether the resistance of the motor's sensor is beyond its limits; a feedback without one has none."""
+    """Return whether the resistance of the motor's sensor is beyond its limits; false for a feedback without one."""
     found = drive.sensor_resistance[lane]
     return found > 0.0 and (found < drive.sensor_lowest[lane] or found > drive.sensor_highest[lane])
 
 
 @stage
 def ambient_temperature(drive, lane, told):
-    """Return whether it is too hot around the drive."""
+    """Return whether the ambient temperature is too high."""
     return drive.ambient[lane] > drive.ambient_limit[lane]
 
 
@@ -149,25 +149,25 @@ def over_speed(drive, lane, told):
 
 @stage
 def contouring(drive, lane, told):
-    """Return whether the axis is farther from its demand than P-Max..., or than 6065h for longer than 6066h."""
+    """Return whether the following error exceeds P-Max..., or than 6065h for longer than 6066h."""
     most = drive.error_turns[lane] + drive.error_angle[lane]
     by_position = drive.drive_function[lane] > 0.0 and drive.loop_level[lane] == 2.0
     if by_position and 0.0 < most < abs(drive.position_demand[lane] - drive.theta_meas[lane]):
         return True
-    # Whole milliseconds; half a period keeps the sum's rounding out.
+    # In whole milliseconds; half a period avoids rounding errors of the sum.
     return drive.following_time[lane] > drive.following_error_time[lane] + 5e-4
 
 
 @stage
 def trajectory(drive, lane, told):
-    """Return whether a cyclic set-point asks for more speed than the motor may have."""
+    """Return whether a cyclic set-point demands more speed than the motor may have."""
     cyclic = acts_as(drive.mode_display[lane]) == CSP and drive.drive_function[lane] > 0.0
     return cyclic and drive.stopping[lane] == 0 and abs(drive.velocity_demand[lane]) > drive.overspeed[lane]
 
 
 @stage
 def current_regulation(drive, lane, told):
-    """Return whether a phase has no current although there should be some."""
+    """Return whether a phase lacks the demanded current."""
     return open_load_a(drive, lane, told) or open_load_b(drive, lane, told)
 
 
@@ -192,7 +192,7 @@ def brake_resistance(drive, lane, told):
 
 @stage
 def brake_supply(drive, lane, told):
-    """Return whether there is a brake to be released, and too little voltage for it."""
+    """Return whether a brake must be released and its supply voltage is too low."""
     return drive.static_brake[lane] == 1 and drive.brake_supply[lane] < BRAKE_SUPPLY
 
 
@@ -210,7 +210,7 @@ def motor_temperature(drive, lane, told):
 
 @stage
 def motor_parameter(drive, lane, told):
-    """Return whether the motor's parameters are none that it could be turned with."""
+    """Return whether the motor's parameters are impossible."""
     i_peak = drive.peak_current[lane]
     return i_peak <= 0.0 or i_peak > drive.current_range[lane] or drive.pole_pairs[lane] < 1.0
 
@@ -230,7 +230,7 @@ def _error(
     held: bool = False,
     known_as: str = "",
 ) -> Cause:
-    """Return the row of an error: it is there by its condition, or because the machine sets it."""
+    """Return the row of an error: it is present by its condition, or because the machine sets it."""
 
     @inlined
     def is_there(drive, lane, told):
@@ -258,7 +258,7 @@ CAUSES = (
     _error(14, "over_speed", CUT, over_speed, held=True),
     _error(15, "contouring", STOP, contouring, held=True, known_as=FOLLOWING_ERROR),
     _error(16, "trajectory", STOP, trajectory, held=True),
-    # From outside the axis, too: its network was stopped or lost.
+    # Also for causes outside the axis: its network was stopped or lost.
     _error(17, "host_communication", STOP, register=NETWORK, held=True, known_as=COMMUNICATION),
     _error(18, "drive_ramp_e2", STOP),
     _error(19, "current_regulation", CUT, current_regulation, register=CURRENT, held=True),
@@ -269,10 +269,10 @@ CAUSES = (
     _error(25, "i2t", STOP, i2t, held=True),
     _error(26, "motor_temperature", STOP, motor_temperature),
     _error(27, "motor_parameter", CUT, motor_parameter),
-    # The manual has no code for them: they stop the axis, and statusword bit 11 tells it.
+    # The manual has no code for them: they stop the axis, and set statusword bit 11.
     Cause("positive_software_limit", LIMIT, 0, 0, causes.above_limit, BLOCKS_POSITIVE, software=True, silent=True),
     Cause("negative_software_limit", LIMIT, 0, 0, causes.below_limit, BLOCKS_NEGATIVE, software=True, silent=True),
-    # The axis has left its limits: no command, and nothing else ends with it.
+    # The axis has left its limits: it is no command, and ends nothing else.
     Cause(FAULT_RESET, WARN, 0x00, 0x0),
 )
 FAULTS = sum(1 << row for row, cause in enumerate(CAUSES) if cause.reaction in (CUT, STOP))  # as bits of `present`

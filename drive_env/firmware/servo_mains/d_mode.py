@@ -1,11 +1,11 @@
-"""The gate of a drive whose own mode must fit the mode of operation: else it takes nothing from its master.
+"""The gate of a drive whose D-Mode must match the mode of operation: otherwise it ignores its master.
 
-Which D-Mode each mode of operation needs is data of the device. A mismatch "disconnects" the drive from the master
-(TGZ manual, section on 6060h): controlword and set-points are ignored, statusword bit 9 (remote) is 0. What an axis
-does that was enabled then, the manual does not say. Here it makes a quick stop, and its power goes off at standstill,
-since nobody is left who could stop it; after the mismatch has ended it must be enabled anew, step by step.
+The D-Mode for each mode of operation is data of the device. A mismatch "disconnects" the drive from the master (TGZ
+manual, section on 6060h): controlword and set-points are ignored, statusword bit 9 (remote) is 0. The manual does not
+say what an enabled axis does then. Here it makes a quick stop, and its power goes off at standstill, since no master
+can stop it any more; after the mismatch has ended it must be enabled anew, step by step.
 
-The gate is looked at once per supervision period: both numbers may be changed within one, in either order.
+The gate is checked once per supervision period: both numbers may be changed within one, in either order.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ def is_remote(drive, lane):
 
 @stage
 def look_at_gate(drive, lane, dt):
-    """Connect or disconnect the axis, once per period; one that is disconnected while it moves is stopped.
+    """Connect or disconnect the axis, once per period; an axis disconnected while it moves is stopped.
 
-    One that the service program has enabled (own_commands.py) is connected after it has stopped.
+    An axis enabled by the service program (own_commands.py) is connected after it has stopped.
     """
     has_fit = fits(drive, lane)
     drive.gate_fits[lane] = 1 if has_fit and drive.mode[lane] != 0 else 0
@@ -52,7 +52,7 @@ def look_at_gate(drive, lane, dt):
         fsa.command(drive, lane)
     if drive.fsa[lane] != fsa.STOPPING:
         return
-    # By 605Ah a quick stop may end in a state that holds the motor: here its power goes off all the same.
+    # By 605Ah a quick stop may end in a state that holds the motor: here its power goes off in any case.
     stands = drive.velocity_demand[lane] == 0.0 and abs(drive.omega_slow[lane]) <= drive.standstill[lane]
     if drive.quick_stop_option[lane] >= fsa.STOP_AND_STAY and (stands or drive.stop_time[lane] > fsa.LONGEST_STOP):
         drive.controlword[lane] = DISABLE_VOLTAGE

@@ -1,21 +1,21 @@
-"""What two-axis servo amplifiers on mains have in the record beside what every servo drive has.
+"""Fields of two-axis servo amplifiers on mains in the record, in addition to those of all servo drives.
 
-Names that a device binds, or a test reads:
+Names that a device binds or a test reads:
 
-- peak_current: M-Ipeak [A]: what 32767 of every torque object is, which are currents in the record
-- i_low, i_high: what C-LimN, C-LimP, M-Ipeak and the image leave of the current [A]; i_max is the greater of them
+- peak_current: M-Ipeak [A]: the current of 32767 in torque objects, which are currents in the record
+- i_low, i_high: current limits [A] by C-LimN, C-LimP, M-Ipeak and the image; i_max is the greater one
 - target_torque: 6071h [A]: set-point of cst and pt, feed-forward in csp and ip, with torque_offset (loops.py)
-- image_limit: current limit of the process images, raw: 0 none, 32767 no current at all
+- image_limit: current limit of the process images, raw: 0 no limit, 32767 no current
 - d_mode: 2303h, 2403h;  d_mode_needed: by mode of operation, 0 any (d_mode.py)
-- profile_shape: 6086h as it is, -3 to 1 (common/shaped.py)
+- profile_shape: 6086h, -3 to 1 (common/shaped.py)
 - following_error_time: 6066h [s]
-- overspeed: [rad/s]: over-speed, and what a cyclic set-point may ask for at most
-- inputs_set: inputs that the machine sets, bits 0 to 7; switch_input: which input each switch is wired to
+- overspeed: over-speed, and the limit of cyclic set-points [rad/s]
+- inputs_set: inputs that the machine sets, bits 0 to 7; switch_input: the input that each switch is wired to
 - digital_inputs: 4000h, bits 0 to 7;  input_word 60FDh, the same in bits 16 to 23
 - negative_, positive_, home_switch_mask: Homing_NegLimSwitchMask, ...: masks over bits 0 to 7
 - error_bits: errors that the machine sets, by their number in the device's error register
-- status_flags: the device's error register now: bit k is error k
-- u_dc, chopper, mains_energy, mains_loss, brake_energy, idle_energy, brake_heat: of the link, both axes alike
+- status_flags: the device's present error register: bit k is error k
+- u_dc, chopper, mains_energy, mains_loss, brake_energy, idle_energy, brake_heat: of the link, equal for both axes
 """
 
 from __future__ import annotations

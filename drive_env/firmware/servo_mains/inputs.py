@@ -1,6 +1,6 @@
-"""The digital inputs of a module: which of them switches are wired to, and which of them homing looks at.
+"""The digital inputs of a module: those wired to switches, and those used by homing.
 
-A module has eight inputs that both axes see. Each switch of a load is wired to one; a machine may set the others. The
+A module has eight inputs common to both axes. Each switch of a load is wired to one; a machine may set the others. The
 drive knows its switches by masks over the inputs (Homing_NegLimSwitchMask, Homing_PosLimSwitchMask,
 Homing_ReferenceSwitchMask): a switch is active while an input of its mask is; with a mask of 0 there is no such switch.
 """
@@ -18,7 +18,7 @@ LEVELS_SHIFT = 16  # of 60FDh: the lower half is 0
 
 @stage
 def pressed(drive, lane):
-    """Return the inputs that switches of an axis' load set, as bits."""
+    """Return the inputs set by the switches of an axis' load, as bits."""
     x, levels = drive.load_position[lane], 0
     for k in range(3):
         if drive.wired[lane] & (1 << k) and drive.switch_low[k, lane] <= x and x <= drive.switch_high[k, lane]:
@@ -42,7 +42,7 @@ def read_module_inputs(drive, rates):
 
 @stage
 def find_switches(drive, lane, dt):
-    """Write the switches as homing looks at them: `inputs`, in the order of common/inputs.py, and homing_switches."""
+    """Write the switches for homing: `inputs`, in the order of common/inputs.py, and homing_switches."""
     levels = drive.digital_inputs[lane]
     found = drive.inputs[lane] & ENABLE
     found |= LEFT if levels & drive.negative_switch_mask[lane] else 0

@@ -1,21 +1,20 @@
 """Position P and velocity PI of a servo amplifier, with feed-forward of speed and current, and the current's limit.
 
-The regulators are told by a gain and an integration time (C-K and C-Ti, V-K and V-Ti); the position loop adds a share
-of the speed that its set-points have (P-SFF).
-Torque objects are shares of the motor's peak current (M-Ipeak): 32767 is all of it. The manual has 6071h as the
-set-point of cst and pt, and in csp and ip as "the feedforward torque value", which "is added to the desired value of
-the current regulator". Of the current limit it prints no equation, only its ends: 0 is no limitation, "where maximal
-current = M-Ipeak", 32767 is full limitation. Taken is the straight line between them,
+The regulators have a gain and an integration time (C-K and C-Ti, V-K and V-Ti); the position loop adds a share of its
+set-points' speed (P-SFF). Torque objects are shares of the motor's peak current (M-Ipeak): 32767 is 100 %. The manual
+has 6071h as the set-point of cst and pt, and in csp and ip as "the feedforward torque value", which "is added to the
+desired value of the current regulator". For the current limit it gives only the ends: 0 is no limitation, "where
+maximal current = M-Ipeak", 32767 is full limitation. A straight line is assumed between them,
 
     i_most = M-Ipeak (32767 - limit) / 32767
 
-and what lies above 32767 is full limitation, too. C-LimN and C-LimP limit each sign besides, in thousandths of M-Inull
-(in mA of amplitude: C-Lim M-Inull / 1000, as the maker's page has it), V-LimN and V-LimP what the position loop asks
-for.
+and values above 32767 are full limitation, too. C-LimN and C-LimP also limit each sign, in thousandths of M-Inull (in
+mA of amplitude: C-Lim M-Inull / 1000, as the maker's page has it), V-LimN and V-LimP the speed demanded by the position
+loop.
 
-C-CogCompFac is the share of the motor's cogging that a current takes away in every mode. "Before using function must be
-measured compensation data of motor" (the maker's page), and no register holds them: here they are those of the motor as
-it is, at the angle that its feedback tells.
+C-CogCompFac is the share of the motor's cogging that a current compensates in every mode. "Before using function must
+be measured compensation data of motor" (the maker's page), but no register has them: here they are the motor's true
+ones, at the angle of its feedback.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ FULL_LIMITATION = 32767.0
 
 @inlined
 def share_current(drive):
-    """Write i_low, i_high: what C-LimN, C-LimP, M-Ipeak and the images leave; i_max, and torque_demand_share."""
+    """Write i_low, i_high: the limits by C-LimN, C-LimP, M-Ipeak and the images; i_max, and torque_demand_share."""
     for lane in range(LANES):
         peak, nominal = drive.peak_current[lane], drive.nominal_motor_current[lane]
         most = peak * (1.0 - drive.image_limit[lane] / FULL_LIMITATION)
@@ -48,7 +47,7 @@ def share_current(drive):
 
 @inlined
 def find_integral_shares(drive, tick, window):
-    """Write what the integrators take of P e per sample, from the integration times; ticks and windows in s."""
+    """Write the integrators' shares of P e per sample, from the integration times; ticks and windows in s."""
     for lane in range(LANES):
         current, velocity = drive.current_integration[lane], drive.velocity_integration[lane]
         drive.current_i[lane] = tick / current if current > 0.0 else 0.0
@@ -57,7 +56,7 @@ def find_integral_shares(drive, tick, window):
 
 @stage
 def feed_forward_current(drive, lane):
-    """Write the current that ip and csp add; an axis that stops, waits or is blocked is driven by its loops alone."""
+    """Write the feed-forward current of ip and csp; an axis that stops, waits or is blocked has none."""
     follows = (
         acts_as(drive.mode_display[lane]) == CSP
         and drive.fsa[lane] == fsa.ENABLED
@@ -85,7 +84,7 @@ def motion_loops(drive):
         total = between(drive.velocity_sum[lane] + proportional * drive.velocity_i[lane], low, high)
         i_loop = between(between(proportional + total, low, high) + drive.torque_feed_forward[lane], low, high)
         i_direct = between(drive.torque_demand[lane], low, high)
-        # While torque is commanded the integrator follows it, or a change to a velocity mode would jump.
+        # While torque is commanded the integrator follows it, otherwise a change to a velocity mode would jump.
         total = between(i_direct - proportional, low, high) if level == 0 else total
         i_ref = i_direct if level == 0 else i_loop
         # A current that waits for the brake holds the axis meanwhile.

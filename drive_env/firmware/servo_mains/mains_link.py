@@ -3,13 +3,14 @@
     C u du/dt = u i_mains - sum of the bridges' power - idle power - u^2 / R_brake - u^2 G_short
 
 The rectifier feeds whenever its voltage is above the link's, through the resistance of the supply, and through the
-charging resistance until the link is charged; it takes nothing back. What one axis brakes another axis uses; the rest
-charges the link until the chopper burns it. A tick is split: what bridges and idle take leaves the energy exactly
-(u^2 falls by 2 P dt / C), then resistor, short circuit and rectifier act one after the other, each as the exponential
-of its own time constant, and each counts the energy of what it did to the voltage: the sum of all is that of the link.
+charging resistance until the link is charged; it does not feed back. Braking energy of one axis is used by another; the
+rest charges the link until the chopper burns it. A tick is split: power of bridges and idling reduces the energy
+exactly (u^2 falls by 2 P dt / C), then resistor, short circuit and rectifier act one after the other, each as the
+exponential of its own time constant, and each counts the energy of its change of voltage: the sum is the change of the
+link's energy.
 
 Axes 2k and 2k + 1 of one machine share a link. Both compute it, with the same numbers, so that neither waits for the
-other. Voltage of the rectifier: the greatest of the three line voltages, that of a lost phase's remaining pair.
+other. Voltage of the rectifier: the greatest of the three line voltages; with a lost phase that of the remaining pair.
 """
 
 from __future__ import annotations
@@ -55,17 +56,17 @@ STATE = (
     Field("brake_hot", "f8", "", "1: too hot, the chopper waits until it has cooled"),
 )
 
-BRAKE_COOLED = 0.8  # share of the greatest rise below which the chopper may work again
+BRAKE_COOLED = 0.8  # share of the greatest temperature rise below which the chopper may work again
 
 
 @inlined
 def find_rectifier_voltage(drive, h):
-    """Move the mains on by a window of h [s]: writes rectifier_voltage, the greatest of the line voltages there are."""
+    """Advance the mains by a window of h [s]: writes rectifier_voltage, the greatest of the present line voltages."""
     for lane in range(LANES):
         angle = drive.mains_angle[lane] + TWO_PI * h * drive.mains_frequency[lane]
         angle = angle - TWO_PI if angle > TWO_PI else angle
         drive.mains_angle[lane] = angle
-        # Rectified, the three line voltages repeat every sixth of a period; the greatest is within half of it.
+        # Rectified, the three line voltages repeat every sixth of a period; the greatest is within half of that.
         within = angle - SIXTH * np.floor(angle * (1.0 / SIXTH)) - 0.5 * SIXTH
         of_one = drive.mains_phase_lost[lane] > 0.5
         _, c = sine_cosine(angle if of_one else within)
@@ -74,7 +75,7 @@ def find_rectifier_voltage(drive, h):
 
 @inlined
 def share_rectifier(drive):
-    """Give the second axis of a pair that shares a link the first one's rectifier."""
+    """Copy the rectifier's voltage from the first to the second axis of a pair that shares a link."""
     for pair in range(LANES // 2):
         first, second = 2 * pair, 2 * pair + 1
         own = drive.rectifier_voltage[second]
@@ -91,11 +92,11 @@ def owner(drive, lane):
 def derive_link(drive, dt):
     """Compute the constants of a tick of dt [s]: a division costs a tick as much as ten products.
 
-    What logic takes is constant down to the under-voltage; below, where its supply gives up, it falls with the square
-    of the voltage: a constant power would never let an empty link be charged again.
+    The logic's power is constant down to the under-voltage; below, it falls with the square of the voltage, since a
+    constant power would prevent an empty link from charging.
 
-    Writes tick_mobility, idle_now, half_capacitance, link_pull, link_share, link_burn, link_decay, and brings the
-    second axis of a pair, which may have been started anew alone, back to the link's voltage.
+    Writes tick_mobility, idle_now, half_capacitance, link_pull, link_share, link_burn, link_decay, and restores the
+    link's voltage in the second axis of a pair, which may have been restarted alone.
     """
     for lane in range(LANES):
         first = owner(drive, lane)
@@ -115,7 +116,7 @@ def derive_link(drive, dt):
 
 @stage
 def watch_link(drive, dt):
-    """Bridge the charging resistance of a link that is charged, and warm the brake resistor, once per period dt [s]."""
+    """Bridge a charged link's charging resistance, and update the brake resistor's heat, once per period dt [s]."""
     for lane in range(LANES):
         u, mains = drive.u_dc[lane], drive.supply_voltage[owner(drive, lane)]
         if u >= CHARGED * mains:
@@ -136,11 +137,11 @@ def watch_link(drive, dt):
 
 @inlined
 def move_link(drive, dt):
-    """Move the link's voltage on by a tick of dt [s]: writes u_dc, chopper and the energies."""
+    """Advance the link's voltage by a tick of dt [s]: writes u_dc, chopper and the energies."""
     for pair in range(LANES // 2):
         first, second = 2 * pair, 2 * pair + 1
         one, other = drive.bridge_power[first], drive.bridge_power[second]
-        # A lane that is no axis may hold anything, and 0 times nan is none: it is chosen, not multiplied.
+        # A lane without an axis may hold any value, and 0 times nan is nan: it is selected, not multiplied.
         drive.partner_power[first] = other if drive.link_shared[first] > 0.5 else 0.0
         drive.partner_power[second] = one if drive.link_shared[second] > 0.5 else 0.0
     for lane in range(LANES):
@@ -153,7 +154,7 @@ def move_link(drive, dt):
         drive.chopper[lane] = chopper
         shared = drive.link_shared[lane]
         idle = (1.0 + shared) * drive.idle_now[lane]
-        # Whatever the order, both axes of a pair must find the same sum: one of two terms has only one.
+        # Both axes of a pair must compute the same sum: that of two terms does not depend on their order.
         bridges = drive.bridge_power[lane] + drive.partner_power[lane]
         square = u * u - drive.link_pull[lane] * (bridges + idle)
         square = square if square > SMALLEST_VOLTAGE * SMALLEST_VOLTAGE else SMALLEST_VOLTAGE * SMALLEST_VOLTAGE
@@ -175,7 +176,7 @@ def move_link(drive, dt):
 
 @stage
 def forget_link(drive, lane):
-    """Begin anew: a charged link, a cool resistor, nothing counted."""
+    """Reset: a charged link, a cool resistor, energies of 0."""
     drive.chopper[lane] = 0.0
     drive.link_charged[lane] = 1.0
     drive.bridge_power[lane] = 0.0

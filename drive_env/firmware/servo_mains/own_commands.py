@@ -1,16 +1,16 @@
-"""Commands that are not CiA 402's: control of the native image, and K-Command of the service modes.
+"""Commands beyond CiA 402: control of the native image, and K-Command of the service modes.
 
-The native image's control (bit 0 clear errors, bit 1 enable the power stage) acts at its edges, as the same commands do
-of a controlword; with D-Mode 3 it makes 6060h 8 as it enables, since such a master knows no mode of operation. Where
-csv needs D-Mode 10, that makes it 9, and the image's set-points are speeds as long as its control enables.
-A controlword that stops an axis wins over an edge that enables it in the same period; another edge enables it then.
+The native image's control (bit 0 clear errors, bit 1 enable the power stage) acts at its edges, like the same commands
+of a controlword; with D-Mode 3 it sets 6060h to 8 when it enables, since such a master knows no mode of operation. If
+csv needs D-Mode 10, that sets it to 9, and the image's set-points are speeds as long as its control enables. A
+controlword that stops an axis overrides an edge that enables it in the same period; it needs another edge then.
 
 K-Command (bits 1 and 0 are 01: enable; bit 3: clear errors) is that of the maker's service program. It acts while the
 master is disconnected or has no mode (6060h is 0), in the modes of the D-Mode: K-I, K-V or K-P_Angle and K-P_Revol are
 the set-point in 1, 2 and 3, Speed of the profile generator in 6, and DPosAngle and DPosRevol in 7 (Speed, with its Mode
-0). An axis that is enabled so stops by a quick stop, and its power goes off, when K-Command, the D-Mode, or a mode that
-fits says so; the master is connected after that alone. It is enabled again by another 0 to 01 of K-Command, never by
-one that was there before an error, or before power-on.
+0). An axis enabled in this way makes a quick stop, and its power goes off, when K-Command, the D-Mode, or a matching
+mode demands it; only after that is the master connected. It is enabled again by another 0 to 01 of K-Command, never by
+one from before an error or power-on.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ NEW_SET_POINT = int(cia402.NEW_SET_POINT)
 
 @stage
 def clear_errors(drive, lane):
-    """Leave fault if none of its causes is there."""
+    """Leave fault if no cause is present."""
     fsa.reset_fault(drive, lane, drive.present[lane] & FAULTS == 0)
 
 
 @stage
 def step_up(drive, lane):
-    """Give the next command on the way to operation enabled; return whether the axis is there."""
+    """Give the next command on the way to operation enabled; return whether the axis is in it."""
     state = drive.fsa[lane]
     if state == fsa.ENABLED:
         return True
@@ -52,7 +52,7 @@ def step_up(drive, lane):
 
 @stage
 def native_mode(drive, lane):
-    """Return the mode of operation that a D-Mode is to the native image; 0: none."""
+    """Return the mode of operation of a D-Mode for the native image; 0 if it has none."""
     if drive.d_mode[lane] == POSITION_MODE:
         return CSP
     speed = drive.d_mode[lane] == FIELDBUS_SPEED and drive.d_mode_needed[CSV, lane] == FIELDBUS_SPEED
@@ -61,7 +61,7 @@ def native_mode(drive, lane):
 
 @stage
 def is_stopped(drive, lane):
-    """Return whether a command took the axis down a state, or into a quick stop, since the period before."""
+    """Return whether a command took the axis down a state, or into a quick stop, since the previous period."""
     before, now = drive.native_fsa[lane], drive.fsa[lane]
     return fsa.DISABLED < before <= fsa.ENABLED and (now < before or now > fsa.ENABLED)
 
@@ -84,7 +84,7 @@ def obey_native_control(drive, lane, dt):
             modes.request_mode(drive, lane, mode)
             drive.disconnected[lane] = 0
     if control & ENABLE and drive.mode[lane] == CSV and native_mode(drive, lane) == CSV:
-        # 2^32 of the set-point are 1 rpm, where they are a revolution of a position.
+        # 2^32 of the set-point are 1 rpm, while for a position they are a revolution.
         drive.target_velocity[lane] = drive.target_position[lane] / 60.0
     if before & ~control & ENABLE:
         drive.native_wants[lane] = 0
@@ -98,7 +98,7 @@ def obey_native_control(drive, lane, dt):
 
 @stage
 def service_mode(drive, lane):
-    """Return the mode of operation that a D-Mode is to K-Command; 0: none."""
+    """Return the mode of operation of a D-Mode for K-Command; 0 if it has none."""
     own = drive.d_mode[lane]
     if own == CURRENT_MODE:
         return CST
@@ -113,7 +113,7 @@ def service_mode(drive, lane):
 
 @stage
 def obey_service(drive, lane, dt):
-    """Enable, stop and lead an axis by K-Command; writes `service`: 0 off, 1 on, 2 stopping."""
+    """Enable, stop and command an axis by K-Command; writes `service`: 0 off, 1 on, 2 stopping."""
     wants = drive.service_command[lane] & SERVICE_MASK == SERVICE_ENABLE
     clears = drive.service_command[lane] & SERVICE_CLEAR
     if clears and not drive.service_before[lane] & SERVICE_CLEAR and drive.gate_fits[lane] == 0:
@@ -140,7 +140,7 @@ def obey_service(drive, lane, dt):
     if drive.service[lane] == 2 and drive.drive_function[lane] == 0.0:
         drive.service[lane] = 0
     if drive.service[lane] == 1 and drive.fsa[lane] == fsa.ENABLED:
-        if drive.service_leads[lane] == 0:  # no position of before moves it
+        if drive.service_leads[lane] == 0:  # an earlier position must not move it
             drive.service_leads[lane] = 1
             drive.service_position[lane] = drive.theta_meas[lane]
             drive.profile_position[lane] = drive.theta_meas[lane]
@@ -151,7 +151,7 @@ def obey_service(drive, lane, dt):
 
 @stage
 def lead(drive, lane, mode):
-    """Put mode and set-points of the service in place of the master's, for this period."""
+    """Replace the master's mode and set-points by those of the service, for this period."""
     drive.masters_mode[lane] = drive.mode[lane]
     drive.masters_torque[lane] = drive.target_torque[lane]
     drive.masters_velocity[lane] = drive.target_velocity[lane]
@@ -179,7 +179,7 @@ def lead(drive, lane, mode):
 
 @stage
 def give_back(drive, lane):
-    """Give the master its mode and its set-points back, as it wrote them."""
+    """Restore the mode and set-points written by the master."""
     if drive.leads[lane] == 1:
         drive.leads[lane] = 0
         drive.mode[lane] = drive.masters_mode[lane]
@@ -191,7 +191,7 @@ def give_back(drive, lane):
 
 @stage
 def forget_commands(drive, lane):
-    """Begin anew: no command of before acts."""
+    """Reset: no earlier command acts."""
     drive.native_before[lane] = int(drive.native_control[lane]) & (CLEAR | ENABLE)
     drive.native_wants[lane] = 0
     drive.native_fsa[lane] = drive.fsa[lane]

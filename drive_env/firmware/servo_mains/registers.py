@@ -1,10 +1,10 @@
-"""Registers of the amplifier's maker: settings that become what the stages read, and readings that only show.
+"""Registers of the amplifier's maker: settings that are converted for the stages, and readings.
 
-A feedback's resolution is told by its type (F-Type): by itself (Hiperface DSL, EnDat), by F-Resolution, or as four
-counts a pulse of F-IncrEnc. An external encoder of F-ExtIncrEnc pulses sits on the shaft of the module's first
-motor, and counts from power-on. With M-StaticBrake the drive moves a brake at its output: current flows for
-D-DelayUnbrake_Enable before the brake is released, and for D-DelayDisable_Brake after it was applied. The output's
-current is as much of the largest as the brake's supply is of 24 V. The enable input must have been closed for
+A feedback's resolution depends on its type (F-Type): it is given by the encoder (Hiperface DSL, EnDat), by
+F-Resolution, or as four counts per pulse of F-IncrEnc. An external encoder of F-ExtIncrEnc pulses sits on the shaft of
+the module's first motor, and counts from power-on. With M-StaticBrake the drive controls a brake at its output: current
+flows for D-DelayUnbrake_Enable before the brake is released, and for D-DelayDisable_Brake after it was applied. The
+output's current over the largest is the brake's supply over 24 V. The enable input must have been closed for
 D-DelayEnable_Hwen before an axis is enabled.
 """
 
@@ -25,15 +25,15 @@ PT1000, PT1000_SLOPE = 1000.0, 3.851e-3  # ohm at 0 degC, 1/K (IEC 60751, mean o
 COUNTER_PERIOD = 2.0**32
 ON, HARDWARE, SOFTWARE, RELEASED, NO_ERROR, INITIALISED, FIELDBUS = 1, 2, 4, 8, 16, 32, 64  # bits of aDriveStatus
 BRAKE_VOLTAGE = 24.0  # V, of the brake's supply
-INPUTS_AT = 2.0**28  # the lowest of the four inputs among them
+INPUTS_AT = 2.0**28  # position of the lowest of the four inputs
 
 
 @inlined
 def read_settings(drive, dt):
-    """Write what settings are to the stages: counts, angle of commutation, delays, output of the brake, cogging."""
+    """Convert settings for the stages: counts, angle of commutation, delays, output of the brake, cogging."""
     drive.block_compensates_cogging[0] = 0
     for lane in range(LANES):
-        torque = drive.phase_factor[lane] * drive.n_p[lane] * drive.psi_nominal[lane]  # N m of an ampere
+        torque = drive.phase_factor[lane] * drive.n_p[lane] * drive.psi_nominal[lane]  # N m per ampere
         share = drive.cogging_compensation[lane]
         drive.cogging_current[lane] = share * drive.cogging_torque[lane] / torque if torque > 0.0 else 0.0
         if drive.cogging_current[lane] != 0.0:
@@ -52,9 +52,9 @@ def read_settings(drive, dt):
         drive.hardware_time[lane] = drive.hardware_time[lane] + dt if closed else 0.0
         wait = drive.hardware_delay[lane] - drive.hardware_time[lane]
         delay = (drive.unbrake_delay[lane] if has_brake else 0.0) + (wait if wait > 0.0 else 0.0)
-        # While an axis waits for it the delay is the one of the command.
+        # While an axis waits for it, the delay is that at the command.
         drive.enable_delay[lane] = drive.enable_delay[lane] if drive.transition_pending[lane] == 4 else delay
-    for pair in range(LANES // 2):  # what a module has once is its first axis'
+    for pair in range(LANES // 2):  # a module's single registers are its first axis'
         first, second = 2 * pair, 2 * pair + 1
         shared = drive.link_shared[second] > 0.5
         drive.undervoltage[second] = drive.undervoltage[first] if shared else drive.undervoltage[second]
@@ -69,7 +69,7 @@ def read_settings(drive, dt):
 
 @inlined
 def find_readings(drive, dt):
-    """Write readings that are means, or are computed of others: RMS currents, I2t, the temperature sensor."""
+    """Write readings that are means, or computed from others: RMS currents, I2t, the temperature sensor."""
     for lane in range(LANES):
         for phase in range(3):
             current = drive.adc_current[phase, lane]
@@ -96,7 +96,7 @@ def find_readings(drive, dt):
 
 @stage
 def energise(drive, lane, dt):
-    """Keep the stage on while its current waits for the brake, and move the brake at the output."""
+    """Keep the stage on while its current waits for the brake, and advance the brake at the output."""
     ready = drive.hardware_time[lane] >= drive.hardware_delay[lane]
     if drive.holding[lane] == 1 and ready and drive.angle_source[lane] != alignment.DISABLED:
         drive.stage_on[lane] = 1.0
@@ -107,7 +107,7 @@ def energise(drive, lane, dt):
 
 @stage
 def tell_status(drive, lane):
-    """Write the error register, a bit for each error that holds or is shown until the reset, aDriveStatus and Rdy."""
+    """Write the error register, a bit for each error that is present or shown until the reset, aDriveStatus and Rdy."""
     reached = drive.target_reached[lane]
     drive.profile_ready[lane] = reached if reached != drive.reached_before[lane] else drive.profile_ready[lane]
     drive.reached_before[lane] = reached
@@ -125,7 +125,7 @@ def tell_status(drive, lane):
 
 @stage
 def forget_readings(drive, lane):
-    """Begin anew: nothing counted, nothing measured."""
+    """Reset all readings."""
     drive.angle_shifted[lane] = 0.0
     drive.cycle_seen[lane] = drive.set_cycle[lane]
     drive.hardware_time[lane] = 0.0

@@ -1,4 +1,4 @@
-"""The firmware of two-axis servo amplifiers on mains: which stages run when."""
+"""The firmware of two-axis servo amplifiers on mains: the order of its stages."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ from mechanics.kernels.compiled import inlined, stage
 
 @inlined
 def convert_energy(drive, dt, progress):
-    """Turn the tick's mean currents into torque and power, and move the link and the rotors on; see the servo's own."""
+    """Compute torque and power from the tick's mean currents, and advance link and rotors; see the servo's stage."""
     for lane in range(LANES):
         find_torque(drive, lane)
     move_link(drive, dt)
@@ -60,7 +60,7 @@ def convert_energy(drive, dt, progress):
 
 @stage
 def regulate_motion(drive, rates):
-    """Run position and velocity loop, compensate cogging, and add the current asked for to its mean over the period."""
+    """Run position and velocity loop, compensate cogging, and add the demanded current to its mean over the period."""
     motion_loops(drive)
     if drive.block_compensates_cogging[0]:
         compensate_cogging(drive)
@@ -71,14 +71,14 @@ def regulate_motion(drive, rates):
 
 @stage
 def read_mains(drive, rates):
-    """Find the voltage of the rectifier for this window."""
+    """Compute the rectifier's voltage for this window."""
     find_rectifier_voltage(drive, rates.window)
     share_rectifier(drive)
 
 
 @stage
 def prepare_link(drive, rates):
-    """Take the settings in, compute what the ticks need as quotients, and look after the link."""
+    """Read the settings, compute the ticks' quotients, and monitor the link."""
     read_settings(drive, rates.period)
     find_readings(drive, rates.period)
     derive_sensors(drive)
@@ -90,7 +90,7 @@ def prepare_link(drive, rates):
 
 @stage
 def connect(drive, lane):
-    """Begin anew: connected to the master if the D-Mode fits, without anything measured for a time."""
+    """Reset: connected to the master if the D-Mode matches, with all measured times at 0."""
     drive.disconnected[lane] = 0 if d_mode.fits(drive, lane) else 1
     drive.following_time[lane] = 0.0
     drive.reverse_time[lane] = 0.0

@@ -1,4 +1,4 @@
-"""What stepper drives watch: the shared causes, and those of the driver's bridges and the encoder.
+"""Causes of stepper drives: the shared ones, and those of the driver's bridges and the encoder.
 
 Status flags are the driver's error flags, 2102h (TMCM-3313 manual, table 155).
 """
@@ -11,13 +11,13 @@ from drive_env.firmware.common.protection import CUT, FAULT_RESET, FOLLOWING_ERR
 from drive_env.firmware.stepper.stall_guard import stalled
 from mechanics.kernels.compiled import stage
 
-OPEN_LOAD_DEMAND = 0.3  # of the amplitude, that must be asked of a phase
-OPEN_LOAD_CURRENT = 0.05  # of the amplitude, below which there is none
+OPEN_LOAD_DEMAND = 0.3  # of the amplitude, that must be demanded of a phase
+OPEN_LOAD_CURRENT = 0.05  # of the amplitude, below which a phase counts as without current
 
 
 @stage
 def watch_phases(drive, lane, dt):
-    """Measure for how long a phase carries no current although the table asks for it."""
+    """Measure for how long a phase carries no current although the table demands it."""
     on = drive.stage_on[lane] > 0.0
     asked = OPEN_LOAD_DEMAND * drive.amplitude[lane]
     flows = OPEN_LOAD_CURRENT * drive.amplitude[lane]
@@ -48,9 +48,9 @@ def detection_time(setting):
 
 @stage
 def carries_too_much(drive, lane, peak, conductance):
-    """Return whether a bridge with a short to ground of that conductance [S], or without, has too large a current.
+    """Return whether a bridge, with a short to ground of that conductance [S] or without one, has too large a current.
 
-    A short carries its current while the bridge is on; a bridge that is on for less than the detection time misses it.
+    A short carries current while the bridge is on; if that is shorter than the detection time, it is not detected.
     """
     sees = drive.stage_on[lane] > 0.0 and drive.on_time[lane] > detection_time(drive.short_detection[lane])
     carried = peak + (drive.u_dc[lane] * conductance if sees else 0.0)
@@ -73,7 +73,7 @@ def overcurrent_b(drive, lane, told):
 def following_error(drive, lane, told):
     """Return whether the encoder is farther from the demand than the window of 6065h: the motor has lost steps."""
     window = drive.following_error_window[lane]
-    # Not from position_actual: homing has moved demand and steps in this period, and that not yet.
+    # Not from position_actual: homing has moved demand and steps in this period, but not yet that.
     error = abs(drive.position_demand[lane] - drive.theta_meas[lane] + drive.deviation[lane])
     return drive.drive_function[lane] > 0.0 and window > 0.0 and error > window
 
@@ -100,7 +100,7 @@ CUTS = sum(1 << row for row, cause in enumerate(CAUSES) if row and cause.reactio
 
 @stage
 def switch_brake(drive, lane, dt):
-    """Move output and brake on by dt [s]; what cuts the stage also cuts a current that waits for the brake alone."""
+    """Advance output and brake by dt [s]; a cut of the stage also cuts a current that only waits for the brake."""
     if drive.present[lane] & CUTS:
         drive.holding[lane] = 0
     brake.drive_output(drive, lane, dt)

@@ -1,7 +1,7 @@
 """The chopper: how the bridges make the phase currents follow the sine table, once per current tick.
 
-A chopper cycle takes some 20 to 60 us, as long as a tick, so what happens within one acts by its mean effect, from the
-TMC5160 data sheet's description of the cycle:
+A chopper cycle takes some 20 to 60 us, as long as a tick, so only its mean effect is modelled, from the TMC5160 data
+sheet's description of the cycle:
 
 - Spread cycle: on until the current is a hysteresis above the set-point, slow decay for the off time, fast decay until
   it is as much below, slow decay again. The mean current is nearly the set-point's; the ripple is twice the hysteresis
@@ -11,7 +11,7 @@ TMC5160 data sheet's description of the cycle:
   shortest possible on-time, the blank time, allows; and that on-time is the least that a small set-point gets.
 - The ripple warms the winding. Neither its noise nor the beat of two phases is modelled.
 
-Voltage PWM holds a share of the supply that follows the table: the current is what winding and back-EMF make of it.
+Voltage PWM applies a share of the supply that follows the table: the current results from winding and back-EMF.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from mechanics.kernels.compiled import inlined
 HYSTERESIS_UNITS = 512.0  # of the largest current (TMC5160 data sheet, HEND)
 PWM_STEPS = 255.0
 PWM_CLOCKS = 1024.0  # of a period of the voltage PWM (TMC5130 data sheet, pwm_freq 0)
-FINEST = 256.0  # microsteps of the table per full step, by which the driver measures time
-SMALLEST_SLOPE = 1.0  # A/s; a supply that the back-EMF has used up makes no current
+FINEST = 256.0  # microsteps of the table per full step, in which the driver measures time
+SMALLEST_SLOPE = 1.0  # A/s; if the back-EMF uses up the supply, no current can rise
 TWO_PI = 6.283185307179586
 
 
@@ -43,7 +43,7 @@ def larger(x, y):
 
 @inlined
 def slow_decay_clocks(off_time):
-    """Return how long a slow decay takes [clocks] (2097h)."""
+    """Return the duration of a slow decay [clocks] (2097h)."""
     return larger(12.0 + 32.0 * off_time, 64.0)
 
 
@@ -61,7 +61,7 @@ def choose_drive(drive):
         per_clock = speed * drive.full_steps[lane] * (FINEST / TWO_PI) / drive.chopper_clock[lane]
         scale = drive.pwm_amplitude[lane] + gradient * 256.0 * per_clock
         scale = scale if scale < PWM_STEPS else PWM_STEPS
-        # The amplitude is that of the present step of the current; vsense is the chopper's alone.
+        # The amplitude is that of the present current step; vsense applies only to the chopper.
         share = drive.amplitude[lane] * (1.0 + drive.vsense[lane]) / drive.full_scale_current[lane]
         drive.in_pwm[lane] = slow if gradient > 0.0 else 0.0
         drive.pwm_scale[lane] = scale * share
@@ -69,20 +69,20 @@ def choose_drive(drive):
 
 @inlined
 def spread_cycle(rise, fast, lost, off, blank, start, end, falls):
-    """Return ripple [A], duration [s], and by how much the mean current lies above the set-point [A] of such a cycle.
+    """Return ripple [A], duration [s], and excess of the mean current over the set-point [A] of such a cycle.
 
-    The hysteresis falls from the cycle's beginning on, while on and in fast decay. How long both last, up and down, is
+    The hysteresis falls from the cycle's beginning on, while on and in fast decay. Their durations, up and down, are
     the solution of rise up = h(up) + h(up + down) + lost and fast down = h(up) + h(up + down) - lost.
 
     Args:
         rise: Slope of the current while on [A/s].
         fast: Slope in fast decay [A/s].
-        lost: What a slow decay takes off [A].
+        lost: Decrease in a slow decay [A].
         off: Duration of a slow decay [s].
         blank: Blank time [s].
         start: Hysteresis at the cycle's beginning [A].
         end: Lowest hysteresis [A].
-        falls: How fast it falls [A/s].
+        falls: Slope of the hysteresis [A/s].
     """
     determinant = (rise + 2.0 * falls) * (fast + falls) - 2.0 * falls * falls
     up = ((2.0 * start + lost) * (fast + falls) - falls * (2.0 * start - lost)) / determinant
@@ -96,14 +96,14 @@ def spread_cycle(rise, fast, lost, off, blank, start, end, falls):
 
 @inlined
 def constant_off_cycle(rise, lost, off, blank, dropped, fast_decay):
-    """Return ripple [A], duration [s], and how far below its top the mean current lies [A] of such a cycle.
+    """Return ripple [A], duration [s], and distance of the mean current below its maximum [A] of such a cycle.
 
     Args:
         rise: Slope of the current while on [A/s].
-        lost: What the slow decay takes off [A].
+        lost: Decrease in the slow decay [A].
         off: Duration of the slow decay [s].
         blank: Blank time [s].
-        dropped: What fast decay takes off [A].
+        dropped: Decrease in the fast decay [A].
         fast_decay: Its duration [s].
     """
     ripple = larger(dropped + lost, blank * rise)
@@ -114,7 +114,7 @@ def constant_off_cycle(rise, lost, off, blank, dropped, fast_decay):
 
 @inlined
 def find_ripple(drive):
-    """Find what the chopper's cycle does to the mean current in this window.
+    """Compute the effect of the chopper's cycle on the mean current in this window.
 
     Writes ripple, chopper_frequency, on_time, in_spread_cycle, current_shift, current_gain and lowest_share.
     """
@@ -126,7 +126,7 @@ def find_ripple(drive):
         off = slow_decay_clocks(drive.off_time[lane]) * clock * (1.0 + fast_chopper)
         blank = blank_clocks(drive.chopper_blank[lane]) * clock
         fast_decay = 32.0 * drive.hysteresis_start[lane] * clock * (1.0 - fast_chopper)
-        # Slopes of a current of the set-point's size against the whole back-EMF [A/s].
+        # Slopes of a current of the set-point's size at the full opposing back-EMF [A/s].
         per_volt = 1.0 / drive.L_s[lane]
         resisted = (drive.R_s[lane] + drive.on_resistance[lane]) * drive.amplitude[lane]
         u = drive.u_dc[lane] * drive.duty_limit[lane]
@@ -146,7 +146,7 @@ def find_ripple(drive):
         drive.chopper_frequency[lane] = chops / (steady_time if is_constant else spread_time)
         held = drive.pwm_scale[lane] * (PWM_CLOCKS / PWM_STEPS) * clock
         drive.on_time[lane] = held if drive.in_pwm[lane] > 0.5 else (steady if is_constant else spread) / rise
-        # A spread cycle's losses are small where the current is; those of the other do distort the zero crossing.
+        # A spread cycle's losses are small for small currents; those of the other distort the zero crossing.
         drive.current_shift[lane] = end - below if is_constant else 0.0
         drive.current_gain[lane] = 1.0 if is_constant else 1.0 + above / drive.amplitude[lane]
         drive.lowest_share[lane] = (blank - fast_decay) / (blank + fast_decay + off) if is_constant else -1.0
@@ -154,10 +154,10 @@ def find_ripple(drive):
 
 @inlined
 def drain_shorts(drive):
-    """Find what is taken from the DC link in this window beside the winding's power: writes drain.
+    """Compute the current from the DC link in this window besides the winding's power: writes drain.
 
-    A short to ground carries current while the bridge's upper transistor is on, for the share of time that the phase's
-    voltage is of the supply's.
+    A short to ground carries current while the bridge's upper transistor is on, for a share of time equal to the
+    phase's voltage over the supply.
     """
     for lane in range(LANES):
         shorts = drive.short_a[lane] * abs(drive.u_a[lane]) + drive.short_b[lane] * abs(drive.u_b[lane])
@@ -166,13 +166,13 @@ def drain_shorts(drive):
 
 @inlined
 def phase_voltage(reference, shift, offset, slope, lowest, largest):
-    """Return the mean voltage of a phase in a tick [V] that brings its current to the set-point, as far as it can.
+    """Return the mean voltage of a phase in a tick [V] that brings its current to the set-point, as far as possible.
 
     Args:
         reference: Set-point [A].
-        shift: By how much the size of the mean current lies above it [A].
+        shift: Excess of the mean current over it [A].
         offset: Voltage that brings the current to 0 [V].
-        slope: Voltage for each ampere more [V/A].
+        slope: Voltage per additional ampere [V/A].
         lowest: Lowest voltage along the set-point's direction [V].
         largest: Highest voltage along it [V].
     """

@@ -1,8 +1,7 @@
-"""CoolStep: as much current as the load needs, by the load reading of StallGuard2.
+"""CoolStep: adapts the current to the load, by the load reading of StallGuard2.
 
 At each reading below the lower threshold the current rises by 1, 2, 4 or 8 of its 32 steps; after 32, 8, 2 or 1
-readings that are not below the upper one it falls by a step. It stays between the run current and a half or a quarter
-of it.
+readings not below the upper one it falls by a step. It stays between the run current and a half or a quarter of it.
 """
 
 from __future__ import annotations
@@ -15,16 +14,16 @@ THRESHOLD_UNIT = 32.0  # of the reading, for each step of 209Ah and 209Ch
 
 @stage
 def reduction_span(drive, lane, wanted):
-    """Return by how many steps CoolStep may lower a current of `wanted` steps, 0...31 (2098h scales the number)."""
+    """Return how many steps CoolStep may lower a current of `wanted` steps, 0...31 (2098h scales the number)."""
     share = 0.25 if drive.cool_minimum[lane] > 0.5 else 0.5
     return wanted - float(int(wanted * share))
 
 
 @inlined
 def adapt_current(drive):
-    """Raise or lower the current after a fresh reading: writes cool_reduction, which is 0 where CoolStep does not work.
+    """Raise or lower the current after a fresh reading: writes cool_reduction, which is 0 if CoolStep is inactive.
 
-    It works above the speed of 20A5h, while StallGuard2 reads the load, and with a lower threshold above 0.
+    It is active above the speed of 20A5h, while StallGuard2 reads the load, and with a lower threshold above 0.
     """
     for lane in range(LANES):
         reads = drive.stage_on[lane] * (1.0 - drive.in_pwm[lane]) * drive.in_spread_cycle[lane] > 0.5
@@ -42,7 +41,7 @@ def adapt_current(drive):
         few = 1.0 if drive.cool_up[lane] < 0.5 else 2.0
         many = 4.0 if drive.cool_up[lane] < 2.5 else 8.0
         rise = few if drive.cool_up[lane] < 1.5 else many
-        # Readings between the thresholds change nothing; a rise begins the count anew.
+        # Readings between the thresholds change nothing; a rise restarts the count.
         count = drive.cool_count[lane] + (1.0 if high else 0.0)
         falls = count >= asked
         count = 0.0 if falls or low or not works else count
@@ -55,6 +54,6 @@ def adapt_current(drive):
 
 @stage
 def forget_reduction(drive, lane):
-    """Begin anew with the whole current."""
+    """Reset to the full current."""
     drive.cool_count[lane] = 0.0
     drive.cool_reduction[lane] = 0.0

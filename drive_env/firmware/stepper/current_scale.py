@@ -1,4 +1,4 @@
-"""Which current flows when: while the motor turns, while its speed changes, and some time after it has come to rest."""
+"""The phase current: while the motor turns, while its speed changes, and some time after it has come to rest."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ RAMP_CLOCKS = 262144.0  # 2^18, for each step of the ramp down (TMC5160 data she
 def scale_current(drive, lane, dt):
     """Choose the step of the current once per period of dt [s]: writes current_scale, amplitude and stage_on.
 
-    With an off time of 0 the bridges are off, and the motor runs free (2097h).
+    With an off time of 0 the bridges are off, and the motor turns freely (2097h).
     """
     energised = drive.drive_function[lane] > 0.0 or drive.holding[lane] == 1
     drive.stage_on[lane] = 1.0 if energised and drive.off_time[lane] > 0.0 else 0.0

@@ -1,4 +1,4 @@
-"""DcStep: above a speed the steps wait for the rotor, so that a motor with too much load becomes slower and loses none.
+"""DcStep: above a speed the steps wait for the rotor, so that an overloaded motor slows down instead of losing steps.
 
 With full steps and the high speed chopper (20B7h, 20B8h), which it needs, the driver makes the next step once the
 on-time of the phase that it will reverse is no longer than 20B4h. With the load angle d of the present full step that
@@ -6,10 +6,10 @@ phase has the back-EMF psi w sin(d - 45 degrees) against its current i, so that 
 
     t_on = t_off (R i + e) / (u_dc - R i - e)
 
-is short once the rotor has come near enough. The chip looks at each chopper cycle; a window of 0.2 ms is longer than
-one, so that the condition acts by its mean effect: solved for e it tells how far the field may be ahead of the rotor,
-and the steps of a window go no farther. They never go slower than 20B3h, and a motor that stands then has stalled:
-without a back-EMF the longest on-time of a step is not above 20B5h, which stops it where 20A4h says so.
+is short once the rotor is near enough. The chip checks each chopper cycle; a window of 0.2 ms is longer, so only the
+mean effect is modelled: solved for e the condition gives the largest lead of the field over the rotor, which limits the
+steps of a window. Their speed never falls below 20B3h, and a motor that stands then has stalled: without a back-EMF the
+longest on-time of a step is not above 20B5h, which stops it if 20A4h says so.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ HALF_PI = 1.5707963267948966
 ROOT_HALF = 0.7071067811865476  # share of the amplitude that each phase carries in a full step
 SMALLEST_EMF = 1e-9  # V
 STALL_UNIT = 16.0  # clocks, of 20B5h
-FULL_STEPS_OF_STALL = 4.0  # a rotor that slips has turned back by them
+FULL_STEPS_OF_STALL = 4.0  # within which a slipping rotor has turned back
 
 
 @inlined
 def release_steps(drive, h):
-    """Let the field go no farther ahead of the rotor in the coming window of h [s] than the on-times say.
+    """Limit the field's lead over the rotor in the coming window of h [s] by the on-times.
 
-    Writes step_rate, held_way, and stalled where the rotor makes no back-EMF.
+    Writes step_rate, held_way, and stalled if the rotor has no back-EMF.
     """
     for lane in range(LANES):
         planned = drive.planned_rate[lane]
@@ -49,7 +49,7 @@ def release_steps(drive, h):
         u = drive.u_dc[lane] * drive.duty_limit[lane]
         resisted = (drive.R_s[lane] + drive.on_resistance[lane]) * drive.amplitude[lane] * ROOT_HALF
         per_speed = drive.psi[lane] * drive.n_p[lane] * direction
-        # What the back-EMF may be at that on-time, as a share of its peak.
+        # The back-EMF allowed at that on-time, as a share of its peak.
         share = (u * time / (time + off) - resisted) / larger(per_speed * drive.omega_m[lane], SMALLEST_EMF)
         share = share if share < 1.0 else 1.0
         share = share if share > -1.0 else -1.0
@@ -58,7 +58,7 @@ def release_steps(drive, h):
         ahead -= TWO_PI * np.floor(ahead / TWO_PI + 0.5)
         most = HALF_PI + np.arcsin(share)
         room = most - ahead + direction * drive.n_p[lane] * drive.omega_m[lane] * h
-        # A rotor as far ahead of the field opposes the phase as well; and no on-time is shorter than the blank time.
+        # A rotor equally far ahead of the field opposes the phase, too; and no on-time is shorter than the blank time.
         waits = ahead < -most or time <= blank_clocks(drive.chopper_blank[lane])
         allowed = 0.0 if waits else room / (per_rad * h)
         rate = larger(allowed, least)
@@ -66,7 +66,7 @@ def release_steps(drive, h):
         rate = rate if works else planned
         drive.step_rate[lane] = rate
         drive.held_way[lane] += (planned - rate) * h
-        # Four full steps have ended: their mean speed tells the peak of the back-EMF, however the rotor swings.
+        # Four full steps have ended: their mean speed gives the peak of the back-EMF, however the rotor swings.
         windows = drive.dc_windows[lane]
         way = abs(drive.step_position[lane] - drive.dc_start[lane]) * 4.0 * per_rad * (1.0 / TWO_PI)
         ended = works and windows > 0.0 and way >= FULL_STEPS_OF_STALL
@@ -84,9 +84,9 @@ def release_steps(drive, h):
 
 @stage
 def slow_ramp(drive, lane, dt):
-    """Take the demand back to where the steps are that have waited; its speed goes to theirs with the mode's ramp.
+    """Move the demand back to the waiting steps; its speed changes to theirs with the mode's ramp.
 
-    Set-points of csp are the master's: there the steps catch up.
+    In csp, whose set-points come from the master, the steps catch up instead.
     """
     held = drive.held_way[lane]
     drive.held_way[lane] = 0.0
@@ -100,7 +100,7 @@ def slow_ramp(drive, lane, dt):
 
 @stage
 def forget_waiting(drive, lane):
-    """Begin anew: no step waits."""
+    """Reset: no step waits."""
     drive.planned_rate[lane] = 0.0
     drive.held_way[lane] = 0.0
     drive.dc_windows[lane] = 0.0

@@ -1,7 +1,7 @@
-"""What the stages of stepper drives have in the record beside what every drive has.
+"""Fields of stepper drives in the record, in addition to those of all drives.
 
-Settings of the driver's chip are its register's numbers; the stages know what they mean. Object numbers are those of
-the TMCM-6212 and TMCM-3313 manuals.
+Settings of the driver's chip are register values, which the stages interpret. Object numbers are those of the TMCM-6212
+and TMCM-3313 manuals.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""What a stepper drive knows of its position: its own steps, and an encoder on the shaft where there is one.
+"""Position of a stepper drive: its own steps, and an encoder on the shaft, if any.
 
-The encoder's index (channel N) is active for one count of each turn, at a true angle of the disc. It comes when N
-becomes what the drive takes for active: by the right polarity the counter then stands at the same count from both
-sides, by the wrong one a count beyond it. Steps are taken where they were at that moment within the window.
+The encoder's index (channel N) is active for one count of each turn, at a true angle of the disc. It counts when N
+changes to the drive's active level: with the right polarity the counter then has the same value from both sides, with
+the wrong one a count more. The steps are those at that time within the window.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ def derive_encoder(drive):
 
 @inlined
 def watch_index(drive):
-    """Look for the index in the window that has passed: writes index_seen, index_position and the latch."""
+    """Search the index in the last window: writes index_seen, index_position and the latch."""
     for lane in range(LANES):
         edges = (drive.theta_m[lane] + drive.encoder_error[lane]) * drive.encoder_counts[lane] * (1.0 / TWO_PI)
         before = drive.true_edges[lane]
         up = 1.0 if edges >= before else 0.0
         wrong = abs(drive.index_polarity[lane] - drive.index_inverted[lane])
-        # Upwards N becomes active at its first edge, downwards at its second, inverted the other way round.
+        # Upwards N becomes active at its first edge, downwards at its second, inverted vice versa.
         first = drive.index_edge[lane] + abs(1.0 - up - wrong)
         came, at, count = index_in_window(drive, lane, edges, first, up)
         moved = edges - before
@@ -57,8 +57,7 @@ def watch_index(drive):
 def measure_motion(drive, h):
     """Read step counter and encoder once per window of h [s].
 
-    Writes theta_meas and omega_meas, which are the steps', theta_encoder, omega_encoder, position_actual and
-    deviation.
+    Writes theta_meas and omega_meas (of the steps), theta_encoder, omega_encoder, position_actual and deviation.
     """
     watch_index(drive)
     for lane in range(LANES):
@@ -66,8 +65,8 @@ def measure_motion(drive, h):
         before = drive.count[lane]
         per_count = TWO_PI * drive.turns_per_count[lane]
         turned = (count - drive.count_zero[lane]) * per_count
-        # Without current the rotor may be turned by hand: then the axis is where the encoder sees it. In a loop
-        # it is anyway.
+        # Without current the rotor may be turned by hand: then the axis' position is the encoder's. In a loop it is in
+        # any case.
         is_off = drive.drive_function[lane] < 0.5 and drive.loop_closed[lane] < 0.5
         takes = is_off and drive.position_sensor[lane] > -0.5 and drive.takes_encoder_position[lane] > 0.5
         shift = drive.step_position[lane] - turned if takes else drive.step_shift[lane]

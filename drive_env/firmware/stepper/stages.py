@@ -1,4 +1,4 @@
-"""The firmware of stepper drives: which stages run when."""
+"""The firmware of stepper drives: the order of its stages."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ def collect_torque(drive, s, weight, moment):
 
 
 def tick_with(step: Stage) -> Stage:
-    """Return the stage that runs the current loop once, with what steps the field for a tick."""
+    """Return the stage that runs the current loop once, with a stage that steps the field for a tick."""
 
     @stage
     def run_tick(drive, rates, k):
         """Run the current loop once: steps, chopper, winding, torque for the load's next steps.
 
-        One stage, since a call between two of them takes some nanoseconds, 25,000 times a second.
+        One stage, since each call takes some nanoseconds, 25,000 times a second.
         """
         step(drive, rates.tick)
         chop(drive)
@@ -73,7 +73,7 @@ def watch_load(drive, rates):
 
 @stage
 def prepare_chopper(drive, rates):
-    """Find how the bridges drive in this window, and the winding's exact step for its ticks."""
+    """Choose the drive of the bridges in this window, and compute the winding's exact step for its ticks."""
     for s in range(rates.substeps):
         for lane in range(LANES):
             drive.tau_window[s, lane] = 0.0
@@ -86,12 +86,12 @@ def prepare_chopper(drive, rates):
 
 @stage
 def warm(drive, rates):
-    """Move temperatures on: copper loss of currents and ripple."""
+    """Advance the temperatures: copper loss of currents and ripple."""
     for lane in range(LANES):
         square = drive.i_a[lane] * drive.i_a[lane] + drive.i_b[lane] * drive.i_b[lane]
         square += drive.ripple[lane] * drive.ripple[lane] * (1.0 / 6.0)
-        square = square if square < LARGEST_SQUARE else 0.0  # a frozen lane's currents may be no numbers
-        # What a short to ground carries warms the stage alone, while its bridge is on.
+        square = square if square < LARGEST_SQUARE else 0.0  # a frozen lane's currents may be non-finite
+        # The current of a short to ground warms only the stage, while its bridge is on.
         u_dc = drive.u_dc[lane]
         shorts = drive.short_a[lane] * drive.short_a[lane] * abs(drive.u_a[lane])
         shorts += drive.short_b[lane] * drive.short_b[lane] * abs(drive.u_b[lane])
@@ -103,7 +103,7 @@ def warm(drive, rates):
 
 @stage
 def prepare_quotients(drive, rates):
-    """Compute what windows and ticks need as quotients."""
+    """Compute the quotients for windows and ticks."""
     derive_encoder(drive)
     derive_steps(drive)
     derive_link(drive, rates.tick)
@@ -111,7 +111,7 @@ def prepare_quotients(drive, rates):
 
 @stage
 def spread_steps(drive, rates):
-    """Plan the steps of the coming period, and leave out of it what no drive of a block needs."""
+    """Plan the steps of the coming period, without parts that no drive of a block needs."""
     if rates.period > 0.0:
         plan_steps(drive, rates.period)
     find_noise(drive)
@@ -123,13 +123,13 @@ def spread_steps(drive, rates):
 
 @stage
 def tell_status(drive, lane):
-    """Write 2102h: the driver's error flags of the causes that hold."""
+    """Write 2102h: the driver's error flags of present causes."""
     drive.status_flags[lane] = drive.cause_flags[lane]
 
 
 @stage
 def halt(drive, lane):
-    """Leave no number behind that is none."""
+    """Replace non-finite state by 0."""
     forget_velocity(drive, lane)
     drive.step_rate[lane] = 0.0
     drive.i_a[lane] = 0.0
@@ -139,7 +139,7 @@ def halt(drive, lane):
 
 @stage
 def power_on(drive, lane):
-    """Begin anew: the steps at zero, the table at its first entry, wherever the rotor stands; the encoder at zero."""
+    """Reset: steps and encoder at zero, the table at its first entry, for any angle of the rotor."""
     drive.init_state[lane] = start_up.DONE
     drive.step_position[lane] = 0.0
     drive.step_rate[lane] = 0.0

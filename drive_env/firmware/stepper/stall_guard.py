@@ -1,17 +1,16 @@
-"""StallGuard2: how much load the motor has, read from the bridges' voltages, and the stop when it stalls.
+"""StallGuard2: the motor's load, read from the bridges' voltages, and the stop when it stalls.
 
-The driver tells the load from its choppers: for how long they are on and in fast decay, in the quarters of the period
-in which a phase's current falls. An unloaded rotor gives energy back then, and the mean voltage is against the current;
-the nearer the load angle comes to 90 degrees, the more has to be put in. With sinusoidal currents i, field at speed w
+The driver derives the load from its choppers: how long they are on and in fast decay, in the quarters of the period in
+which a phase's current falls. An unloaded rotor gives energy back then, and the mean voltage is against the current;
+the nearer the load angle comes to 90 degrees, the more power is needed. With sinusoidal currents i, field at speed w
 and load angle d, the mean voltage of a falling phase, against its current and as a share of the supply, is
 
     given back = (2 / pi) (L i w + psi w (cos d - sin d) - R i) / u_dc
 
-which falls all the way to 90 degrees, all but linearly with the torque. Below a speed the resistance is all there is;
-where the back-EMF uses the supply up, the bridges' voltages saturate, and tell little of the load. Neither needs a
-case.
+which falls all the way to 90 degrees, all but linearly with the torque. At low speed only the resistance acts; when the
+back-EMF uses up the supply, the bridges' voltages saturate and show little of the load. Both follow from the formula.
 
-The same mean is taken of both phases at once, in the frame of the field, in which it is steady. The reading is 1023
+The mean is computed for both phases at once, in the frame of the field, in which it is constant. The reading is 1023
 times it, and 209Eh shifts it by up to the whole range; the chip's own scale is not published.
 """
 
@@ -41,27 +40,27 @@ def collect_voltage(drive):
 
 @inlined
 def read_load(drive, tick, ticks):
-    """Take a reading when another full step has been made, or four of them with the filter.
+    """Take a reading after each full step, or after four of them with the filter.
 
-    Writes load_value, load_is_fresh, and stalled where the reading has come to 0 above the speed of 20A4h. Only a
-    spread cycle has the quarters of fast decay that are measured: otherwise the reading is 0, and stops nothing.
+    Writes load_value, load_is_fresh, and stalled if the reading is 0 above the speed of 20A4h. Only a spread cycle has
+    the measured quarters of fast decay: otherwise the reading is 0, without a stop.
 
     Args:
         drive: The record.
         tick: Current-loop period [s].
-        ticks: How many of them a window has, by which the collected voltages are summed.
+        ticks: Number of ticks in a window, whose voltages are summed.
     """
     for lane in range(LANES):
         rate = drive.step_rate[lane]
         direction = 1.0 if rate > 0.0 else -1.0
         measures = drive.stage_on[lane] * (1.0 - drive.in_pwm[lane]) * drive.in_spread_cycle[lane]
-        # A measurement goes on as long as the motor turns the same way.
+        # A measurement continues while the motor turns in one direction.
         goes_on = measures > 0.5 and rate * drive.load_direction[lane] > 0.0
         windows = drive.load_windows[lane] + 1.0
         way = abs(drive.step_position[lane] - drive.load_start[lane]) * drive.full_steps[lane] * (1.0 / TWO_PI)
         asked = FULL_STEPS_OF_FILTER if drive.load_filter[lane] > 0.5 else 1.0
         fresh = goes_on and way >= asked
-        # The voltages were in force half a tick before the field was where they were collected.
+        # The voltages were applied half a tick before the field's collected angle.
         a = 0.5 * tick * rate * drive.full_steps[lane] * 0.25
         sa = a * (1.0 - a * a * (1.0 / 6.0))
         ca = 1.0 - 0.5 * a * a
@@ -87,7 +86,7 @@ def read_load(drive, tick, ticks):
 
 @inlined
 def stop_stalled(drive):
-    """Make no more steps on a motor that has stalled, from this window on."""
+    """Stop the steps of a stalled motor, from this window on."""
     for lane in range(LANES):
         drive.step_rate[lane] = 0.0 if drive.stalled[lane] > 0.5 else drive.step_rate[lane]
         drive.planned_rate[lane] = 0.0 if drive.stalled[lane] > 0.5 else drive.planned_rate[lane]
@@ -95,7 +94,7 @@ def stop_stalled(drive):
 
 @stage
 def hold_stalled(drive, lane, dt):
-    """Let the demand rest where the steps were stopped, until the stage is off: a ramp would go on through a stall."""
+    """Hold the demand where the steps were stopped, until the stage is off: a ramp would continue through a stall."""
     if drive.drive_function[lane] == 0.0:
         drive.stalled[lane] = 0.0
     if drive.stalled[lane] > 0.5:
@@ -112,7 +111,7 @@ def stalled(drive, lane, told):
 
 @stage
 def forget_load(drive, lane):
-    """Begin anew, without a reading."""
+    """Reset: no reading."""
     drive.load_value[lane] = 0.0
     drive.load_is_fresh[lane] = 0.0
     drive.load_direction[lane] = 0.0

@@ -1,8 +1,7 @@
-"""Steps: the demand of the modes becomes microsteps, and a microstep an entry of the sine table.
+"""Steps: converts the demand of the modes to microsteps, and a microstep to an entry of the sine table.
 
-The demand moves once per supervision period; between two of them the steps come evenly. The table's waves are
-symmetrical, as the driver makes them: entry k stands in the middle of its microstep, so that full steps lie where both
-phases carry the same current.
+The demand moves once per supervision period; in between the steps are spread evenly. The table's waves are symmetrical,
+as in the driver: entry k is in the middle of its microstep, so that at full steps both phases carry the same current.
 """
 
 from __future__ import annotations
@@ -17,15 +16,15 @@ from mechanics.kernels.compiled import inlined
 
 HALF_PI = 1.5707963267948966
 SMALLEST_WAY = 1e-6  # microsteps
-HALF = 4294967296.0  # 2^32: of a counter of 64 bits
+HALF = 4294967296.0  # 2^32: half of a 64-bit counter
 
 
 @inlined
 def derive_steps(drive):
-    """Compute what a microstep is: writes counts_per_turn, steps_per_rad, table_length and rad_per_entry."""
+    """Compute the size of a microstep: writes counts_per_turn, steps_per_rad, table_length and rad_per_entry."""
     for lane in range(LANES):
         per_step = 2.0 ** drive.microstep_resolution[lane]
-        # 2001h may be 0, which is no motor that could be counted with.
+        # 2001h may be 0, with which no motor can be counted.
         steps = drive.full_steps[lane] if drive.full_steps[lane] > 0.0 else 1.0
         drive.counts_per_turn[lane] = steps * per_step
         drive.steps_per_rad[lane] = steps * per_step / TWO_PI
@@ -41,10 +40,10 @@ def plan_steps(drive, dt):
     """
     for lane in range(LANES):
         way = drive.position_demand[lane] + drive.home_shift[lane] + drive.step_shift[lane] - drive.step_position[lane]
-        # What rounding has left of the last period's way is no motion.
+        # A rounding error of the last period's distance is not motion.
         way = 0.0 if abs(way) * drive.steps_per_rad[lane] < SMALLEST_WAY else way
         rate = way / dt
-        # Set-points of csp that DcStep's steps wait behind are caught up with so that 6084h ends it at their speed.
+        # Catching up with set-points of csp after DcStep's waiting begins so that 6084h ends it at their speed.
         ahead = drive.velocity_demand[lane] if drive.velocity_demand[lane] * way > 0.0 else 0.0
         left = larger(abs(rate) - abs(ahead), 0.0) * dt
         slows = drive.deceleration[lane] if drive.deceleration[lane] > 0.0 else drive.acceleration[lane]
@@ -56,7 +55,7 @@ def plan_steps(drive, dt):
         drive.step_rate[lane] = rate
         threshold = drive.fullstep_threshold[lane]
         fast = threshold > 0.0 and abs(rate) > threshold
-        # DcStep acts on them as that threshold does; voltage PWM takes its place.
+        # DcStep counts as that threshold; voltage PWM disables it.
         dc_step = drive.dc_speed[lane] > 0.0 and abs(rate) >= drive.dc_speed[lane] and drive.in_pwm[lane] < 0.5
         drive.at_high_speed[lane] = 1.0 if fast or dc_step else 0.0
         drive.in_full_steps[lane] = drive.high_speed_fullstep[lane] * drive.at_high_speed[lane]
@@ -75,7 +74,7 @@ def count_steps(drive, h):
 
 @inlined
 def table_values(drive, lane, position):
-    """Return sine and cosine of the table's entry at a position [rad]."""
+    """Return sine and cosine in the table's entry at a position [rad]."""
     entry = np.floor(position * drive.steps_per_rad[lane] + 0.5)
     entry -= drive.table_length[lane] * np.floor(entry / drive.table_length[lane])
     angle = (entry + 0.5) * drive.rad_per_entry[lane]

@@ -7,8 +7,8 @@ Each phase is a winding of its own; the rotor's flux links them as psi cos(theta
 
 where R is that of winding and stage, and the rotor is at rest where theta_e is the current vector's angle. Iron
 saturates with the current: psi = psi_m / sqrt(1 + saturation (i_a^2 + i_b^2)), in torque and back-EMF alike, so that
-energy balances. The teeth alone give the detent torque -T_d sin(4 theta_e), at rest where one phase would hold the
-rotor. Speed and psi are those of the window.
+energy balances. The teeth cause the detent torque -T_d sin(4 theta_e), with rest positions where one phase would hold
+the rotor. Speed and psi are constant within a window.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ def power_stage(drive):
         mean_b = drive.mean_i[lane] * i_b + from_u * u_b + drive.mean_e[1, lane] * s - drive.mean_e[0, lane] * c
         mean_a = mean_a * on_a
         mean_b = mean_b * on_b
-        # In the middle of the tick, with what angle and currents change within it.
+        # In the middle of the tick, including the change of angle and currents within it.
         sm = s * drive.half_turn_cos[lane] + c * drive.half_turn_sin[lane]
         cm = c * drive.half_turn_cos[lane] - s * drive.half_turn_sin[lane]
         turning = drive.turn_sixth[lane] * ((new_b - i_b) * sm + (new_a - i_a) * cm)
@@ -127,7 +127,7 @@ def power_stage(drive):
 
 @inlined
 def move_rotor(drive, dt, progress):
-    """Take the power from the DC link and move the rotor on through one tick of dt [s]; note the largest currents.
+    """Take the power from the DC link and advance the rotor by one tick of dt [s]; note the largest currents.
 
     `progress` is that of `turn_rotor`.
     """

@@ -1,14 +1,14 @@
-"""Corrections of the velocity by the deviation: how fast load angle control catches up, and the position PID.
+"""Corrections of the velocity by the deviation: catching up in load angle control, and the position PID.
 
-Register numbers as the TMC4361 counts (data sheet, "PID and closed-loop registers"): microsteps a second, f the clock.
+Register numbers as in the TMC4361 (data sheet, "PID and closed-loop registers"): microsteps a second, f the clock.
 
-    v_P = e P / 256       v_I = sum I / 65536, the sum of e at f / 128, within 65536 times 202Dh
-    v_D = (e - e_before) D, e looked at with f / 128 / 202Eh; 0 stands for 256
+    v_P = e P / 256 v_I = sum I / 65536, the sum of e at f / 128, limited to 65536 times 202Dh v_D = (e - e_before) D, e
+    sampled at f / 128 / 202Eh; 0 means 256
 
-All of them together stay within 202Fh. A PID adds them to the ramp's velocity (mode 2) or moves the field by them
-alone (mode 3), and corrects nothing within 2022h, where that is not 0, whatever its sum. In load angle control P and I
-bound the field's velocity on the way back to the ramp's: it may follow an overload however fast. Without P and I 202Fh
-alone bounds it.
+Their sum is limited to 202Fh. A PID adds them to the ramp's velocity (mode 2) or moves the field only by them (mode 3),
+and does not correct deviations within 2022h, if that is not 0, for any sum. In load angle control P and I limit the
+field's velocity on the way back to the ramp's; following an overload is not limited. Without P and I only 202Fh limits
+it.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from mechanics.kernels.compiled import inlined
 PRESCALER = 128.0  # clocks
 P_FRACTION = 256.0
 I_FRACTION = 65536.0
-DEFAULT_DIVIDER = 256.0  # what 0 stands for
+DEFAULT_DIVIDER = 256.0  # meaning of 0
 UNBOUNDED = 1e300  # rad/s
 
 
 @inlined
 def correct(drive, h):
-    """Find the velocities of the corrections for this window of h [s].
+    """Compute the velocities of the corrections for this window of h [s].
 
     Writes field_rate, rate_low and rate_high; correction_sum and the D part's state.
     """
@@ -36,7 +36,7 @@ def correct(drive, h):
         closed = drive.loop_closed[lane]
         is_pid = closed > 1.5
         per_second = drive.motion_clock[lane] / PRESCALER
-        # A catching up that has ended leaves no sum; a PID's holds the axis where it is.
+        # Catching up leaves no sum when it ends; a PID's sum holds the axis in its position.
         total = drive.correction_sum[lane] + e * h
         limit = drive.correction_sum_limit[lane] * I_FRACTION / (per_second * drive.steps_per_rad[lane])
         total = clip(total, limit) if outside else (drive.correction_sum[lane] if is_pid else 0.0)
@@ -46,7 +46,7 @@ def correct(drive, h):
         period = divider / per_second
         passed = drive.derivative_time[lane] + h
         looks = passed >= period * (1.0 - 1e-9)
-        # Several looks within a window act by their mean.
+        # Several samples within a window act by their mean.
         change = drive.position_correction_p[lane] * (e - drive.deviation_before[lane]) * period / passed
         drive.derivative_part[lane] = change if looks else drive.derivative_part[lane]
         drive.deviation_before[lane] = e if looks else drive.deviation_before[lane]
@@ -63,7 +63,7 @@ def correct(drive, h):
         back = back if back > 0.0 else 0.0
         back = back if p + i > 0.0 else most
         back = back if back < most else most
-        # Within the tolerance, or a microstep, nothing is left to catch up with.
+        # Within the tolerance, or a microstep, no deviation is left to catch up with.
         near = drive.correction_tolerance[lane] * drive.steps_per_rad[lane]
         near = (near if near > 1.0 else 1.0) / drive.steps_per_rad[lane]
         free = drive.asks_torque[lane] > 0.5 or abs(e) <= near

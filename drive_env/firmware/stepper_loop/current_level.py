@@ -1,8 +1,8 @@
-"""The current of a closed loop: by the load angle, or as much as a torque mode asks for; and what of it makes torque.
+"""The current of a closed loop: by the load angle, or as demanded by a torque mode; and its torque-producing part.
 
 The scale goes from 2029h without a load angle to 202Ah at 2027h, one step of 255 in 2030h clocks up and 2031h down
-(TMCM-3313 manual, section 1.5.3). It scales the run current, as CoolStep has left it; boost and standby are the open
-loop's.
+(TMCM-3313 manual, section 1.5.3). It scales the run current, as reduced by CoolStep; boost and standby belong to the
+open loop.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ AT_ONCE = 1e9  # steps of the scale in a window
 
 @inlined
 def scale_by_load(drive, h):
-    """Choose the amplitude for this window of h [s] where the encoder commutates: writes loop_scale and amplitude."""
+    """Choose the amplitude for this window of h [s] if the encoder commutates: writes loop_scale and amplitude."""
     for lane in range(LANES):
         steps = drive.full_steps[lane] if drive.full_steps[lane] > 0.0 else 1.0
         beta = drive.load_angle_limit[lane] * (TWO_PI * 4.0 / FULL_ANGLE) / steps
@@ -36,7 +36,7 @@ def scale_by_load(drive, h):
         scale = wanted if wanted - scale < up else scale + up
         scale = scale if drive.loop_scale[lane] - scale < down else drive.loop_scale[lane] - down
         run = drive.run_amplitude[lane]
-        # CoolStep takes steps of the run current away, whatever the load angle leaves of it: the driver scales both.
+        # CoolStep reduces the run current by steps, in addition to the load angle's scale: the driver applies both.
         steps = np.floor(drive.run_current[lane] * (STEPS / SCALES)) + 1.0
         reduction = drive.cool_reduction[lane]
         reduction = reduction if reduction < drive.cool_span[lane] else drive.cool_span[lane]
@@ -52,7 +52,7 @@ def scale_by_load(drive, h):
 
 @inlined
 def tell_torque(drive):
-    """Write torque_current: across the rotor's flux where the encoder commutates, else the size of the current."""
+    """Write torque_current: across the rotor's flux if the encoder commutates, else the absolute current."""
     for lane in range(LANES):
         rotor = drive.step_position[lane] - drive.loop_deviation[lane] + drive.field_shift[lane]
         s, c = sine_cosine(electrical_angle(drive, lane, rotor))

@@ -1,4 +1,4 @@
-"""What a closed loop takes from the encoder: where the axis is, aligned with the steps."""
+"""The axis' position for a closed loop, from the encoder, aligned with the steps."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ from drive_env.firmware.common.arithmetic import TWO_PI
 from drive_env.firmware.record import LANES
 from mechanics.kernels.compiled import inlined
 
-MARGIN = 1.0 + 1e-6  # of a way that the demand's speed explains
+MARGIN = 1.0 + 1e-6  # of a distance explained by the demand's speed
 SMALLEST_WAY = 1e-6  # microsteps
 
 
 @inlined
 def encoder_position(drive, lane):
-    """Return the rotor's position as the encoder has counted it since power-on [rad]."""
+    """Return the rotor's position counted by the encoder since power-on [rad]."""
     return (drive.count[lane] - drive.count_zero[lane]) * TWO_PI * drive.turns_per_count[lane]
 
 
 @inlined
 def see_axis(drive):
-    """Let an axis in a loop be where the encoder sees it.
+    """Take the position of an axis in a loop from the encoder.
 
     Writes loop_deviation, encoder_shift and omega_shown; in a loop theta_meas, omega_meas, theta_encoder and
     position_actual.
@@ -41,9 +41,10 @@ def see_axis(drive):
 
 @inlined
 def seed_steps(drive, dt):
-    """Set the step counter where a demand of this period of dt [s] has not moved, but was taken from the encoder.
+    """Set the step counter if the demand of this period of dt [s] was set from the encoder, not moved.
 
-    So begin enabling, a stop after a fault, torque modes: none of them may move the field. Writes step_position.
+    This is so at enabling, a stop after a fault, and in torque modes, none of which may move the field. Writes
+    step_position.
     """
     for lane in range(LANES):
         position = drive.position_demand[lane] + drive.home_shift[lane] + drive.step_shift[lane]

@@ -1,7 +1,6 @@
-"""What stepper drives with a closed loop have in the record beside what every stepper drive has.
+"""Fields of stepper drives with a closed loop in the record, in addition to those of all stepper drives.
 
-Object numbers are those of the TMCM-3313 manual. Settings of the motion controller are its register's numbers where the
-unit is empty.
+Object numbers are those of the TMCM-3313 manual. Settings of the motion controller without a unit are register values.
 """
 
 from __future__ import annotations

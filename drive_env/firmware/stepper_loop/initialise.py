@@ -1,8 +1,9 @@
-"""When the loop closes: what 2020h asks for, and how the encoder is aligned with the field (2028h, 2120h).
+"""Closing of the loop: by 2020h, after aligning the encoder with the field (2028h, 2120h).
 
-Load angle control commutates by the encoder, so it must know where the field holds the rotor: the axis stands, run
-current flows, the rotor swings in, and its position is taken. A load that pulls at it meanwhile cannot be told from it:
-its angle stays in the offset. A PID does not commutate; its encoder begins where the steps are, at once.
+Load angle control commutates by the encoder, so it must know at which position the field holds the rotor: the axis
+stands, run current flows, the rotor swings in, and its position is stored. The angle of a load that pulls at it
+meanwhile cannot be separated: it stays in the offset. A PID does not commutate; its encoder starts at the steps'
+position, at once.
 """
 
 from __future__ import annotations
@@ -18,12 +19,12 @@ from mechanics.kernels.compiled import stage
 OPEN, LOAD_ANGLE, PID_ON_RAMP, PID_ALONE = 0.0, 1.0, 2.0, 3.0
 
 HOLD_TIME = 0.4  # s: the rotor swings in
-LONGEST_HOLD = 3.0  # s after which its position is taken even if it still swings
+LONGEST_HOLD = 3.0  # s after which its position is stored even if it still swings
 
 
 @stage
 def open_loop(drive, lane):
-    """Leave the loop: the field goes on with the steps from where it is."""
+    """Leave the loop: the field continues with the steps from its present position."""
     drive.loop_closed[lane] = OPEN
     drive.loop_initialised[lane] = 0
     drive.tracks_rotor[lane] = 0.0
@@ -34,7 +35,7 @@ def open_loop(drive, lane):
 
 @stage
 def forget_corrections(drive, lane):
-    """Begin the corrections anew."""
+    """Reset the corrections."""
     drive.correction_sum[lane] = 0.0
     drive.derivative_time[lane] = 0.0
     drive.derivative_part[lane] = 0.0
@@ -56,13 +57,13 @@ def close_loop(drive, lane, mode):
 
 @stage
 def hold(drive, lane, dt):
-    """Hold the standing rotor until it has swung in, and close the loop then."""
+    """Hold the rotor at rest until it has swung in, then close the loop."""
     if drive.init_state[lane] != FIRST_ANGLE:
         drive.settle_time[lane] = 0.0
         if drive.velocity_demand[lane] != 0.0 or drive.step_rate[lane] != 0.0:
             return  # the ramp ends first
         drive.init_state[lane] = FIRST_ANGLE
-    drive.standstill_time[lane] = 0.0  # run current, not that of standstill
+    drive.standstill_time[lane] = 0.0  # run current, not standstill current
     drive.settle_time[lane] += dt
     rests = abs(drive.omega_encoder[lane]) <= drive.standstill[lane]
     if drive.settle_time[lane] > LONGEST_HOLD or (rests and drive.settle_time[lane] > HOLD_TIME):
@@ -71,7 +72,7 @@ def hold(drive, lane, dt):
 
 @stage
 def choose_loop(drive, lane, dt):
-    """Open or close the loop as 2020h says, once per period of dt [s]; without an encoder (606Ah) it is open."""
+    """Open or close the loop by 2020h, once per period of dt [s]; without an encoder (606Ah) it is open."""
     steps = np.floor(drive.run_current[lane] * (STEPS / 256.0)) + 1.0
     drive.run_amplitude[lane] = drive.full_scale_current[lane] / (1.0 + drive.vsense[lane]) * steps / STEPS
     wanted = drive.loop_mode[lane]
@@ -90,14 +91,14 @@ def choose_loop(drive, lane, dt):
             close_loop(drive, lane, wanted)
         elif drive.init_state[lane] == FIRST_ANGLE:
             open_loop(drive, lane)
-    # A fault's stop is the ramp's alone: a PID whose encoder is broken would run on.
+    # A fault's stop uses only the ramp: a PID with a broken encoder would run on.
     reacts = drive.fsa[lane] == fsa.REACTING
     drive.corrects[lane] = 0.0 if reacts else drive.drive_function[lane]
 
 
 @stage
 def power_on(drive, lane):
-    """Begin anew: the field at the table's first entry, the loop open."""
+    """Reset: the field at the table's first entry, the loop open."""
     drive.field_position[lane] = 0.0
     drive.field_rate[lane] = 0.0
     drive.field_shift[lane] = 0.0
@@ -111,7 +112,7 @@ def power_on(drive, lane):
 
 @stage
 def halt(drive, lane):
-    """Leave no number behind that is none."""
+    """Replace non-finite state by 0."""
     drive.loop_deviation[lane] = 0.0
     drive.omega_encoder[lane] = 0.0
     drive.field_position[lane] = drive.step_position[lane]

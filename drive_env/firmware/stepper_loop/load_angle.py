@@ -1,10 +1,10 @@
-"""Load angle control: the field follows the rotor once the load would pull it further away than 2027h.
+"""Load angle control: the field follows the rotor when the load angle would exceed 2027h.
 
-The field leads the rotor by the deviation times 2021h / 65536 (times 1 within 2022h), by the load angle's limit at
-most: until then it is where the steps are, as in open loop; from then on the torque is the motor's greatest and no step
-is lost. Above 2034h the limit grows by up to 2036h, so that the field weakens the rotor's flux (TMCM-3313 manual,
-sections 1.5.2 and 1.5.4). The motion controller looks at the encoder every few microseconds: in a tick of the current
-loop, at its end.
+The field leads the rotor by the deviation times 2021h / 65536 (times 1 within 2022h), at most by the load angle's
+limit: until then it is at the steps, as in open loop; from then on the torque is the motor's maximum and no step is
+lost. Above 2034h the limit grows by up to 2036h, so that the field weakens the rotor's flux (TMCM-3313 manual, sections
+1.5.2 and 1.5.4). The motion controller reads the encoder every few microseconds; here once at the end of each tick of
+the current loop.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ UNITY = 65536.0
 
 @inlined
 def limit_lead(drive):
-    """Find how far the field may lead the rotor in this window: writes lead_limit and angle_gain."""
+    """Compute the field's largest lead over the rotor in this window: writes lead_limit and angle_gain."""
     for lane in range(LANES):
         above = abs(drive.omega_encoder[lane]) - drive.weakening_velocity[lane]
         width = drive.weakening_width[lane]
@@ -57,7 +57,7 @@ def move_field(drive, dt):
         high = drive.rate_high[lane] * dt
         way = low if way < low else way
         way = high if way > high else way
-        # However slow it may catch up, the field never leaves the rotor behind.
+        # However slowly it may catch up, the field never leaves the rotor behind.
         led = origin + clip(before + way - origin, drive.lead_limit[lane])
         moved = before + drive.field_rate[lane] * dt
         field = led if drive.tracks_rotor[lane] > 0.5 else moved
@@ -76,6 +76,6 @@ def electrical_angle(drive, lane, position):
 
 @inlined
 def lead_of_field(drive, lane):
-    """Return by how much the field leads the rotor [rad], as the loop sees it."""
+    """Return the field's lead over the rotor [rad], as measured by the loop."""
     rotor = drive.step_position[lane] - drive.loop_deviation[lane]
     return np.abs(drive.field_position[lane] - drive.field_shift[lane] - rotor)

@@ -1,6 +1,6 @@
-"""The firmware of stepper drives with a closed loop: those of stepper drives, with a field of its own and corrections.
+"""The firmware of stepper drives with a closed loop: stepper stages, with a separate field and corrections.
 
-The steps are the ramp's position. Where an encoder commutates, or a PID corrects, the field is somewhere else.
+The steps are the ramp's position. If an encoder commutates or a PID corrects, the field has another position.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ def regulate(drive, rates):
 
 @stage
 def take_over(drive, rates):
-    """Let the steps be where a demand was taken from the encoder; a period without length has taken none."""
+    """Set the steps to a demand that was set from the encoder; not in a period without length."""
     if rates.period > 0.0:
         seed_steps(drive, rates.period)
 
 
-# Right after the encoder is read, whatever else looks at the motion in a window.
+# Right after the encoder is read, before other stages use the motion of a window.
 _READ = stepper.STAGES.window.index(stepper.read_motion) + 1
 
 STAGES = replace(

@@ -1,8 +1,8 @@
-"""Torque modes: 6071h is a current across the rotor's flux, which the encoder must tell (load angle control).
+"""Torque modes: 6071h is a current across the rotor's flux, whose angle comes from the encoder (load angle control).
 
-The field leads by the load angle's limit, and the current is as large as it is asked for, up to the run current. Below
-1/32 of that, which a chopper cannot make exactly, the angle makes the torque small. Without load angle control there is
-none: the axis holds, and bit 12 of the statusword tells that the target is ignored.
+The field leads by the load angle's limit, and the current is the demanded one, up to the run current. Below 1/32 of
+that, which a chopper cannot control exactly, the angle reduces the torque. Without load angle control there is no
+torque: the axis holds, and bit 12 of the statusword is 0, since the target is ignored.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ IGNORED = ~0x1000
 
 @stage
 def ask_torque(drive, lane):
-    """Hand the torque demand to field and current, once per period."""
+    """Pass the torque demand to field and current, once per period."""
     asks = drive.tracks_rotor[lane] > 0.5 and drive.drive_function[lane] > 0.0 and drive.loop_level[lane] == 0
     drive.asks_torque[lane] = 1.0 if asks else 0.0
     if not asks:
@@ -35,6 +35,6 @@ def ask_torque(drive, lane):
 
 @stage
 def tell_torque_mode(drive, lane):
-    """Let bit 12 tell that a torque mode has no loop to hand its target to."""
+    """Clear bit 12 if a torque mode has no loop for its target."""
     if drive.mode_display[lane] == cia402.CST and drive.tracks_rotor[lane] < 0.5:
         drive.statusword[lane] &= IGNORED

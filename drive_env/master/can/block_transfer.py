@@ -1,7 +1,7 @@
-"""Block transfers as a client: many bytes with an answer for every 127 segments, and not for each (CiA 301).
+"""Block transfers as a client: one answer per 127 segments instead of one per segment (CiA 301).
 
-What is lost is sent again: the receiver names the last segment that came in order, and the next sub-block begins
-behind it.
+Lost segments are sent again: the receiver names the last segment received in order, and the next sub-block begins after
+it.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from drive_env.node.block_transfer import (
     crc,
 )
 
-BLOCK_FROM = 128  # bytes from which a block transfer is worth its beginning and its end
-RETRIES = 3  # sub-blocks that may come incomplete in a row
+BLOCK_FROM = 128  # bytes from which a block transfer is faster than a segmented one
+RETRIES = 3  # consecutive sub-blocks that may arrive incomplete
 _CRC_ERROR, _WRONG_COMMAND = 0x05040004, 0x05040001
 _COMMAND, _KIND = 0xE3, 0xE1
 
 
 class NoBlockTransferError(Exception):
-    """The server has no block transfer: nothing has begun."""
+    """The server has no block transfer; no transfer has begun."""
 
 
 class SdoChannel(Protocol):
@@ -44,7 +44,7 @@ class SdoChannel(Protocol):
         """Send a frame."""
 
     def send_patiently(self, request: bytes) -> None:
-        """Send a frame, and wait for room where many have gone before."""
+        """Send a frame, and wait for room in the buffer if many were sent before."""
 
     def read_response(self) -> bytes:
         """Return the next frame of the server."""
@@ -71,7 +71,7 @@ def read(channel: SdoChannel, initiated: bytes) -> bytes:
             raise SdoCommunicationError("No SDO response received")
         channel.send_request(bytes((UPLOAD | ACKNOWLEDGE, count, LARGEST_BLOCK)) + bytes(5))
     end = channel.read_response()
-    while end[0] & _COMMAND != UPLOAD_RESPONSE | END:  # what was sent twice
+    while end[0] & _COMMAND != UPLOAD_RESPONSE | END:  # skip segments that were sent twice
         end = channel.read_response()
     unused = end[0] >> 2 & 0x07
     found = bytes(content[: len(content) - unused])
@@ -83,7 +83,7 @@ def read(channel: SdoChannel, initiated: bytes) -> bytes:
 
 
 def _receive_block(channel: SdoChannel, content: bytearray) -> tuple[int, bool]:
-    """Return how many segments of a sub-block came in order, and whether the last of all is among them."""
+    """Return how many segments of a sub-block came in order, and whether the last segment of all is among them."""
     in_order = 0
     while True:
         try:

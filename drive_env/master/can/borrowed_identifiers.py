@@ -1,7 +1,7 @@
-"""Identifiers for PDOs of further axes, which a module of several axes has none for at first.
+"""Identifiers for PDOs of further axes, for which a module of several axes has no default identifiers.
 
 CiA 301 gives four PDOs of each direction to a node. Axis k of node n borrows those of node n + k, as if every axis were
-a node of its own: 281h is TPDO 2 of node 1, 282h the second TPDO of its axis 1. No other node may have that node-ID.
+a separate node: 281h is TPDO 2 of node 1, 282h the second TPDO of its axis 1. No other node may have that node-ID.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from drive_env.canopen.frames import SDO_REQUEST, SDO_RESPONSE
 from drive_env.fieldbus.errors import BusError
 from drive_env.master.can.port import Port
 
-LOOK = 0.1  # s in which a node answers, if there is one
+LOOK = 0.1  # s to wait for the answer of a node
 _DEVICE_TYPE = bytes((0x40, 0x00, 0x10, 0, 0, 0, 0, 0))  # SDO request of 1000h, which every node has
 HIGHEST = 127
 
@@ -31,13 +31,13 @@ class BorrowedIdentifiers:
         self._port = port
         self._nodes = tuple(nodes)
         self._num_axes = num_axes
-        self._free: set[int] = set()  # nodes whose further axes may have them
+        self._free: set[int] = set()  # node-IDs at which no node answers
 
     def node_of(self, node: int, axis: int) -> int:
-        """Return the node-ID whose identifiers an axis of a node has.
+        """Return the node-ID whose identifiers an axis of a node uses.
 
         Raises:
-            BusError: If that node-ID is too high, or a node answers under it, ours or another.
+            BusError: If that node-ID is too high or in use, by one of our nodes or another.
         """
         if node not in self._free:
             self._look(node)

@@ -10,17 +10,17 @@ from drive_env.dictionary.entries import Entry
 
 BIT_RATE = 1_000_000  # bit/s, the highest of classical CAN
 FRAME_BITS = 47  # of a frame without data, the gap after it included (ISO 11898-1)
-SHARE = 0.8  # of a cycle that PDOs beyond those asked for may take: requests and emergencies want the rest
+SHARE = 0.8  # share of a cycle for PDOs beyond the requested ones: SDO requests and emergencies need the rest
 
 
 class BusTime(NamedTuple):
-    """The bus in a cycle; `bit_rate` [bit/s], `cycle` [s], inf where frames take no time."""
+    """Capacity of the bus in a cycle: `bit_rate` [bit/s], `cycle` [s]; inf if frames take no time."""
 
     bit_rate: float = BIT_RATE
     cycle: float = math.inf
 
     def has_room_besides(self, groups: Iterable[Sequence[Entry]], axes: int) -> bool:
-        """Return whether PDOs of these groups, each of so many axes, leave room with all stuff bits there may be."""
+        """Return whether PDOs of these groups, for this number of axes, leave room even with the most stuff bits."""
         bits = FRAME_BITS + axes * sum(_most(group) for group in groups)
         return bits <= SHARE * self.bit_rate * self.cycle
 

@@ -26,7 +26,7 @@ from drive_env.master.can.process_data import PdoProcessData
 from drive_env.master.can.sdo import SdoClient
 
 _EMCY_COB_ID, _PRODUCER_HEARTBEAT = 0x1014, (0x1017, 0)
-TIME_LOOK = 0.012  # s for which a drive in lockstep must stand still
+TIME_LOOK = 0.012  # s during which a drive in lockstep must not move on
 
 
 class CanLink:
@@ -35,9 +35,9 @@ class CanLink:
     Args:
         port: The bus; a `DryPort` for a dry run.
         nodes: Node-IDs.
-        description: What device they are.
-        bus_time: What the bus carries in a cycle.
-        twin_time: How long a second node with the same node-ID may take longer for its answer than the first [s].
+        description: Their device.
+        bus_time: Capacity of the bus in a cycle.
+        twin_time: How much later than the first a second node with the same node-ID may answer [s].
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class CanLink:
         self._network.command(PRE_OPERATIONAL, (self.nodes[node],))
 
     def welcome(self, node: int) -> None:
-        """Take emergencies of a node from the identifier that its 1014h says; BusError if it is two nodes."""
+        """Receive a node's emergencies by the identifier in its 1014h; BusError if two nodes have its node-ID."""
         if self._description.has(_EMCY_COB_ID):
             cob_id = self._read(node, self._description.dictionary.find(_EMCY_COB_ID))
             self._network.move_emergencies(self.nodes[node], cob_id)
@@ -117,14 +117,14 @@ class CanLink:
         self._network.reset([self.nodes[k] for k in nodes])
 
     def take_emergencies(self) -> list[ReceivedEmergency]:
-        """Return and forget the emergencies that came, in their order."""
+        """Return and forget the received emergencies, in their order."""
         return self._network.take_emergencies()
 
     def time_passes(self) -> bool | None:
-        """Look whether a drive that sends heartbeats sends any that are due while no SYNC is sent.
+        """Return whether a drive sends heartbeats that are due although no SYNC is sent.
 
         Returns:
-            None for drives that cannot send any.
+            None for drives that cannot send heartbeats.
 
         Raises:
             BusError: If the node does not answer.
@@ -141,7 +141,7 @@ class CanLink:
                 self.port.drain()
                 beats.clear()
                 time.sleep(TIME_LOOK)
-                self._read(0, producer)  # a node that is late answers after what was due before
+                self._read(0, producer)  # a late node sends due heartbeats before this answer
                 self._write(0, producer, before)
             if noted:
                 signal.raise_signal(noted[0])
@@ -157,7 +157,7 @@ class CanLink:
 
     # --- cycles -----------------------------------------------------------------------------------------------------
     def hand_out(self, words: Sequence[tuple[int, Key, bytes]]) -> None:
-        """Do nothing: a node answers one SDO after the other, which follow as closely as the bus carries them."""
+        """Do nothing: a node answers SDOs one after the other, which follow each other as closely as the bus allows."""
 
     def sync(self) -> None:
         """Send SYNC."""
@@ -168,7 +168,7 @@ class CanLink:
         return self.port.receive(timeout)
 
     def wait(self, done: Callable[[], bool], timeout: float) -> bool:
-        """Receive until `done()` or until `timeout` [s] has passed; return done()."""
+        """Receive until `done()` is true or `timeout` [s] has passed; return done()."""
         return self.port.wait(done, timeout)
 
     def drain(self) -> None:
@@ -180,7 +180,7 @@ class CanLink:
         self.port.close()
 
     def _read(self, node: int, entry: Entry) -> int:
-        """Read a number that a node has once."""
+        """Read a numeric object that a node has once, not per axis."""
         known = self._description
         data = self._clients[node].read(entry.index, entry.sub, known.label(entry, 0), known.patience(entry))
         return int(known.decode(entry, data))

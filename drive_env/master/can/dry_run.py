@@ -1,6 +1,6 @@
-"""A dry run: frames are written down in place of being sent, and a drive that obeys at once is simulated behind it.
+"""A dry run: frames are printed instead of sent, and a drive that obeys at once is simulated.
 
-Without an answer nothing would go on, so reads return the dictionary's defaults or what was written, and the
+Since nothing could go on without answers, reads return the dictionary's defaults or the values written before, and the
 statusword follows the controlword.
 """
 
@@ -15,7 +15,7 @@ from drive_env.dictionary.entries import ObjectDictionary
 from drive_env.fieldbus.description import Description
 from drive_env.master.can.port import Handler, Port
 
-# The statusword of the state that a command leads to.
+# The statusword after each command.
 _OFF, _ENABLED = 0x0240, 0x0637  # enabled, and the target is reached
 _STATES = {
     "disable voltage": _OFF,
@@ -28,14 +28,14 @@ _STATES = {
 
 
 def show_frame(can_id: int, data: bytes, asked: int | None = None) -> str:
-    """Return a frame as candump shows it; of a remote frame, how many bytes it asks for, else None."""
+    """Return a frame as candump shows it; `asked` is the length that a remote frame requests, else None."""
     if asked is not None:
         return f"{can_id:03X}   [{asked}]  remote request"
     return f"{can_id:03X}   [{len(data)}]  {data.hex(' ').upper()}".rstrip()
 
 
 class DryPort(Port):
-    """A port that writes frames down.
+    """A port that prints frames.
 
     Args:
         out: Takes a line of text for each frame.
@@ -45,10 +45,10 @@ class DryPort(Port):
         self._out = out
 
     def subscribe(self, can_id: int, handler: Handler | None) -> None:
-        """Do nothing: nothing comes."""
+        """Do nothing: no frame is ever received."""
 
     def send(self, can_id: int, data: bytes = b"", *, remote: bool = False, length: int = 0) -> None:
-        """Write a frame down."""
+        """Print a frame."""
         self._out(show_frame(can_id, data, length if remote else None))
 
     def receive(self, timeout: float = 0.0, done: Callable[[], bool] | None = None) -> bool:
@@ -64,12 +64,12 @@ class DryPort(Port):
 
 
 class DrySdoClient:
-    """The SDO client of an imagined node.
+    """The SDO client of a simulated node.
 
     Args:
-        port: Where its requests are written down.
+        port: Prints its requests.
         node: Node-ID.
-        description: What device is imagined.
+        description: The simulated device.
     """
 
     def __init__(self, port: DryPort, node: int, description: Description) -> None:

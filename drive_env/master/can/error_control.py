@@ -1,6 +1,7 @@
-"""The drive's watch over its master: it misses heartbeats (1016h) or its life is not guarded (100Ch, 100Dh).
+"""The drive's watch over its master: it expects heartbeats (1016h) or life guarding (100Ch, 100Dh).
 
-Each process sends heartbeats under a node-ID of its own: two that shared one would hide each other's death.
+Each process sends heartbeats under a node-ID of its own: if two shared one, the drives would not notice the death of
+either.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ logger = logging.getLogger(__name__)
 MASTERS = range(96, 128)  # node-IDs under which masters of this library send their heartbeats
 OPERATIONAL = 0x05
 BEATS_PER_TIMEOUT = 3  # of which two may be lost
-FIRST_BEATS = 3  # a drive watches from the first heartbeat that it gets on: one that is lost must not be the only one
+FIRST_BEATS = 3  # a drive watches from the first heartbeat received: a lost one must not be the only one
 STAYS = 1  # 1029h:01: a communication error changes nothing (CiA 301, and the TMCM-1636)
 
 _CONSUMERS, _GUARD_TIME, _LIFE_FACTOR, _ERROR_BEHAVIOUR = 0x1016, (0x100C, 0), (0x100D, 0), (0x1029, 1)
@@ -43,12 +44,12 @@ class Heartbeats:
         self._port = port
         self._heard: dict[int, float] = {}
         self._nodes = tuple(nodes)
-        self.node_id = 0  # ours, once `choose` has found one
+        self.node_id = 0  # set by `choose`
         for node in set(range(1, 128)) - set(nodes):
             port.subscribe(ERROR_CONTROL + node, partial(self._hear, node))
 
     def choose(self) -> None:
-        """Choose a node-ID without heartbeats on the bus; by the process' number two programs choose different ones."""
+        """Choose a node-ID without heartbeats on the bus; two programs differ by their process numbers."""
         self._port.drain()
         if self.node_id and self.node_id not in self._heard:
             return
@@ -76,20 +77,20 @@ class Heartbeats:
 
 
 def is_of_a_watchdog(index: int) -> bool:
-    """Return whether a drive's watch over its master depends on an object, by CiA 301 and, with 6007h, CiA 402."""
+    """Return whether a drive's watch over its master depends on an object (CiA 301; with 6007h, CiA 402)."""
     alone = index in (_CONSUMERS, *(key[0] for key in (_GUARD_TIME, _LIFE_FACTOR, _ERROR_BEHAVIOUR)))
     return alone or cia402.of_first_axis(index) == cia402.ABORT_CONNECTION_OPTION
 
 
 class ErrorControl:
-    """Configures the error control of one node, and puts it back.
+    """Configures the error control of one node, and restores it.
 
     Args:
         node: Node-ID.
         sdo: Its SDO client.
-        description: What device it is.
-        heartbeats: Those of this process.
-        guard: Asks the node for its life.
+        description: Its device.
+        heartbeats: The heartbeats of this process.
+        guard: Sends the node a guarding request.
 
     Attributes:
         kind: "heartbeat", "life guarding" or "none".
@@ -112,7 +113,7 @@ class ErrorControl:
         """Have the drive act when the master falls silent for `timeout` [s].
 
         Raises:
-            NoWatchdogError: If the drive cannot, or watches over another master that lives.
+            NoWatchdogError: If the drive cannot, or watches another master that is alive.
             BusError: If the node does not answer.
         """
         milliseconds = round(1e3 * timeout)
@@ -138,9 +139,9 @@ class ErrorControl:
             )
 
     def _have_it_stop(self) -> None:
-        """Have a communication error lead to "stopped" where 1029h leads elsewhere: pre-operational may stop no axis.
+        """Make a communication error stop the node if 1029h leads elsewhere: pre-operational may stop no axis.
 
-        Of a drive whose values are not known, 0 is taken where a communication error would change nothing.
+        For a drive with undocumented values of 1029h, 0 is written if a communication error would change nothing.
         """
         device = self._description.device
         known = {} if device is None else device.canopen.error_behaviour
@@ -166,18 +167,17 @@ class ErrorControl:
         return self.kind != "none" and (key == _ERROR_BEHAVIOUR or self._objects.holds(key))
 
     def beat(self) -> None:
-        """Ask for the node's life, where it has no heartbeat consumer."""
+        """Send a guarding request, if the node has no heartbeat consumer."""
         if self.kind == "life guarding":
             self._guard()
 
     def restore(self) -> None:
-        """Put the objects back as they were. The caller has proved that the node's axes are off.
+        """Restore the objects. The caller has proved that the node's axes are off.
 
-        The master's heartbeats must go on until then: a drive that still waits for them, and misses them, stops, and
-        answers no more.
+        The master's heartbeats must go on until then: a drive that still expects them would stop and no longer answer.
 
         Raises:
-            BusError: If the drive did not take all of them.
+            BusError: If the drive did not accept all of them.
         """
         self._objects.restore()
         self.kind = "none"
@@ -197,7 +197,7 @@ class ErrorControl:
             raw = int.from_bytes(self._objects.read(key), "little")
             watched, period = raw >> 16 & 0x7F, raw & 0xFFFF
             if key in self._objects or not (watched and period) or watched == self._heartbeats.node_id:
-                pass  # ours, or of no node
+                pass  # our own, or that of no node
             elif self._heartbeats.is_alive(watched, 1e-3 * period):
                 living.append(watched)
                 continue
@@ -217,13 +217,13 @@ class ErrorControl:
 
 
 class Beats:
-    """Heartbeats and guarding requests of all nodes, when they are due.
+    """Sends heartbeats and guarding requests for all nodes when they are due.
 
     Args:
-        heartbeats: Those of this process.
+        heartbeats: The heartbeats of this process.
         controls: Error control of each node.
         timeout: Silence after which a drive acts [s].
-        clock: Gives the time [s].
+        clock: Returns the time [s].
     """
 
     def __init__(
@@ -238,10 +238,10 @@ class Beats:
         self._period = timeout / BEATS_PER_TIMEOUT
         self._clock = clock
         self._next = 0.0
-        self.has_ceased = False  # for good: a drive that cannot be proved off is to stop by itself
+        self.has_ceased = False  # permanent: a drive that cannot be proved off is to stop by itself
 
     def begin(self) -> None:
-        """Send some at once: one alone may be lost."""
+        """Send several at once: a single one may be lost."""
         for _ in range(FIRST_BEATS):
             self._beat()
 
@@ -251,7 +251,7 @@ class Beats:
             self._beat()
 
     def cease(self) -> None:
-        """Send the last ones: a node started meanwhile watches again from them on, and stops by itself, too."""
+        """Send the last ones: a node that was started in between watches again from these on, and then stops, too."""
         self.has_ceased = True
         self.begin()
 
@@ -264,13 +264,13 @@ class Beats:
 
 
 class ErrorControls:
-    """The error control of all nodes, and the heartbeats and requests that keep it quiet.
+    """The error control of all nodes, and the heartbeats and requests that feed it.
 
     Args:
         port: The bus.
         nodes: Node-IDs.
         clients: The nodes' SDO clients.
-        description: What device they are.
+        description: Their device.
     """
 
     def __init__(
@@ -285,14 +285,14 @@ class ErrorControls:
 
     @property
     def detection_time(self) -> float:
-        """The silence after which every node has noticed [s]; infinite while they do not watch."""
+        """The silence after which every node has noticed [s]; infinite while no watchdog is set."""
         return math.inf if self._beats is None else max(control.time for control in self._controls)
 
     def begin(self, silence: float) -> None:
         """Have every node act when its master falls silent for `silence` [s], and begin to send heartbeats.
 
         Raises:
-            NoWatchdogError: If a drive cannot, or watches over another master that lives.
+            NoWatchdogError: If a drive cannot, or watches another master that is alive.
             BusError: If a node does not answer.
         """
         self._heartbeats.choose()
@@ -312,11 +312,11 @@ class ErrorControls:
             self._beats.cease()
 
     def end(self) -> None:
-        """Send no heartbeats any more, since the watchdogs are given up."""
+        """Send no more heartbeats, since the watchdogs are given up."""
         self._beats = None
 
     def is_set(self, node: int) -> bool:
-        """Return whether a node's error control was set and not put back."""
+        """Return whether a node's error control was set and not yet restored."""
         return self._controls[node].kind != "none"
 
     def is_in_force(self, node: int) -> bool:
@@ -332,22 +332,22 @@ class ErrorControls:
         return any(control.holds(key) for control in self._controls)
 
     def restore(self, node: int) -> None:
-        """Put a node's objects back as they were.
+        """Restore a node's objects.
 
         Raises:
-            BusError: If the node did not take all of them.
+            BusError: If the node did not accept all of them.
         """
         self._controls[node].restore()
 
     def forget(self, node: int) -> None:
-        """Forget the settings: the node was reset, and its error control is its own again."""
+        """Forget the settings: the node was reset, and its error control has its own settings again."""
         self._controls[node].forget()
 
     def take_rival(self) -> str:
-        """Return, once, which other program sends heartbeats as ours; "" if none does."""
+        """Return, once, the other program that sends heartbeats under our node-ID; "" if there is none."""
         if not self._heartbeats.is_shared or self._beats is None:
             return ""
-        node, self._heartbeats.node_id = self._heartbeats.node_id, 0  # another one, once the program enables anew
+        node, self._heartbeats.node_id = self._heartbeats.node_id, 0  # another one at the next enabling
         return (
             f"another program sends heartbeats as node-ID {node}, too, so that the drives would not notice the death "
             "of either"
@@ -355,5 +355,5 @@ class ErrorControls:
 
 
 def _ask_for_life(port: Port, node: int) -> None:
-    """Ask a node for its life (node guarding, CiA 301)."""
+    """Send a guarding request to a node (CiA 301)."""
     port.send(ERROR_CONTROL + node, remote=True, length=1)

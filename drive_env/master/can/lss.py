@@ -23,8 +23,8 @@ from drive_env.fieldbus.errors import BusError, NoAnswerError
 from drive_env.master.can.port import Port
 from drive_env.master.can.sdo import SdoClient
 
-# s. Several slaves answer a step of a scan, one after the other: what comes this long after the first answer is theirs,
-# and must not be taken for the answer to the next step.
+# s. Several slaves answer a step of a scan, one after the other: an answer this long after the first still belongs to
+# that step, not to the next.
 ECHO = 0.005
 ANSWER_TIMEOUT = 0.3  # s, of an SDO request to a node that may not be there
 MOST_NODES = 127
@@ -33,7 +33,7 @@ _IDENTITY = 0x1018
 
 
 class LssError(BusError):
-    """A slave refuses, or the bus is not as a service needs it."""
+    """A slave refuses, or the bus is not in the state that a service needs."""
 
 
 class LssMaster:
@@ -54,11 +54,11 @@ class LssMaster:
 
     # --- which slave ----------------------------------------------------------------------------------------------
     def switch_all(self, *, configuration: bool) -> None:
-        """Switch all slaves into configuration, or let all wait."""
+        """Switch all slaves to configuration, or to waiting."""
         self._send(Service.SWITCH_GLOBAL, bytes((CONFIGURATION if configuration else WAITING,)))
 
     def select(self, identity: LssIdentity) -> None:
-        """Switch the slave with an identity into configuration.
+        """Switch the slave with an identity to configuration.
 
         Raises:
             LssError: If no slave with it answers.
@@ -72,7 +72,7 @@ class LssMaster:
             )
 
     def scan(self) -> Iterator[LssIdentity]:
-        """Find the slaves that have no node-ID, one by one; each is in configuration until `switch_all`."""
+        """Find the slaves without a node-ID, one by one; each stays in configuration until `switch_all`."""
         for _ in range(MOST_NODES):
             found = self.fastscan()
             if found is None:
@@ -80,10 +80,10 @@ class LssMaster:
             yield found
 
     def fastscan(self) -> LssIdentity | None:
-        """Find one slave without a node-ID, bit by bit, and switch it into configuration; None if no slave answers.
+        """Find one slave without a node-ID, bit by bit, and switch it to configuration; None if no slave answers.
 
         Raises:
-            LssError: If a slave answers at first and not at last.
+            LssError: If a slave answers at first but not at the end.
         """
         if not self._step(0, FASTSCAN_BEGINS, 0, 0):
             return None
@@ -110,35 +110,35 @@ class LssMaster:
         """Return the identity of the slave in configuration.
 
         Raises:
-            LssError: If none answers.
+            LssError: If no slave answers.
         """
         parts = [self._expect(Service.INQUIRE_VENDOR + part) for part in range(4)]
         return LssIdentity(*(int.from_bytes(answer[1:5], "little") for answer in parts))
 
     def node_id(self) -> int:
-        """Return its node-ID, 255 for none.
+        """Return the node-ID of the slave in configuration; 255 if it has none.
 
         Raises:
-            LssError: If none answers.
+            LssError: If no slave answers.
         """
         return self._expect(Service.INQUIRE_NODE_ID)[1]
 
     def configure_node_id(self, node_id: int) -> None:
-        """Give it a node-ID, 255 to take it away, which its next reset makes its own.
+        """Set its node-ID, in force after its next reset; 255 removes it.
 
         Raises:
-            LssError: If it refuses or none answers.
+            LssError: If it refuses or no slave answers.
         """
         answer = self._expect(Service.CONFIGURE_NODE_ID, bytes((node_id,)))
         if answer[1] != OK:
             raise LssError(f"the node refuses the node-ID {node_id} (error {answer[1]}, {answer[2]}); choose 1 to 127")
 
     def configure_bit_rate(self, bit_rate: int) -> None:
-        """Give it a bit rate [bit/s], which activation or the next power-on makes its own.
+        """Set its bit rate [bit/s], in force after activation or the next power-on.
 
         Raises:
-            ValueError: For one that CiA 305 does not have.
-            LssError: If it refuses or none answers.
+            ValueError: For a bit rate that CiA 305 does not have.
+            LssError: If it refuses or no slave answers.
         """
         row = row_of(bit_rate)
         answer = self._expect(Service.CONFIGURE_BIT_TIMING, bytes((0, row)))
@@ -148,14 +148,14 @@ class LssMaster:
             )
 
     def activate_bit_rate(self, delay: float) -> None:
-        """Let all slaves in configuration fall silent, change their bit rate after `delay` [s], and wait once more."""
+        """Have all slaves in configuration wait `delay` [s] silently, change their bit rate, and wait once more."""
         self._send(Service.ACTIVATE_BIT_TIMING, round(1e3 * delay).to_bytes(2, "little"))
 
     def store(self, timeout: float) -> None:
-        """Let it store its node-ID and bit rate.
+        """Store its node-ID and bit rate.
 
         Raises:
-            LssError: If it cannot, or none answers within `timeout` [s].
+            LssError: If it cannot, or no slave answers within `timeout` [s].
         """
         answer = self._expect(Service.STORE, timeout=timeout)
         if answer[1] != OK:
@@ -164,9 +164,9 @@ class LssMaster:
 
     @contextmanager
     def configuring(self) -> Iterator[None]:
-        """Let all slaves wait at first and, whatever happens, in the end.
+        """Set all slaves to waiting first, and at the end in any case.
 
-        One without a node-ID boots then with the one that it got.
+        A slave without a node-ID then boots with the one that it was given.
         """
         self.switch_all(configuration=False)
         try:
@@ -220,7 +220,7 @@ def identity_of(port: Port, node: int, timeout: float) -> LssIdentity:
         try:
             data = client.read(_IDENTITY, sub, f"{_IDENTITY:04X}h:{sub:02X}", timeout)
         except ObjectAccessError:
-            data = b""  # what a device lacks is 0 in its LSS address
+            data = b""  # an object that the device lacks counts as 0 in its LSS address
         parts.append(int.from_bytes(data[:4], "little"))
     return LssIdentity(*parts)
 
@@ -237,7 +237,7 @@ def is_taken(port: Port, node: int, timeout: float) -> bool:
 
 
 def await_node(port: Port, identity: LssIdentity, node: int, before: int | None, timeout: float) -> None:
-    """Wait until a node that boots answers under its new node-ID, or, where that is 255, under its old one no more.
+    """Wait until a booting node answers under its new node-ID or, if that is 255, no longer under its old one.
 
     Raises:
         LssError: If it does not within `timeout` [s].
@@ -264,7 +264,7 @@ def await_node(port: Port, identity: LssIdentity, node: int, before: int | None,
 
 
 def row_of(bit_rate: int) -> int:
-    """Return the row of CiA 305's table of a bit rate [bit/s]; ValueError for one that it lacks."""
+    """Return the row of a bit rate [bit/s] in CiA 305's table; ValueError if it is not there."""
     row = next((row for row, rate in BIT_RATES.items() if 1000 * rate == bit_rate), None)
     if row is None:
         known = ", ".join(str(1000 * rate) for rate in BIT_RATES.values())
@@ -273,7 +273,7 @@ def row_of(bit_rate: int) -> int:
 
 
 def show(identity: LssIdentity) -> str:
-    """Return an identity as the command line takes it."""
+    """Return an identity in the form of the command line."""
     return ":".join(f"{number:X}" for number in identity)
 
 

@@ -1,4 +1,4 @@
-"""Which objects go into which PDO."""
+"""Distributes objects to PDOs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ PDO_BITS = 64
 
 
 class Slots(NamedTuple):
-    """The PDOs of one direction that an axis has: their numbers (0 is PDO 1), and entries that each takes."""
+    """The PDOs of one direction that an axis may use: their numbers (0 is PDO 1), and how many entries each takes."""
 
     numbers: tuple[int, ...]
     entries: int
@@ -21,15 +21,15 @@ def pack(entries: Sequence[Entry], slots: Slots, *, keep_order: bool) -> list[li
     """Return the entries of each PDO, in the order of `slots.numbers`, or None if they do not fit.
 
     Args:
-        entries: What to map; each has its size in bits.
-        slots: The PDOs there are.
-        keep_order: Keep the order if it fits so, since a drive takes PDOs and their entries one after the other.
+        entries: The entries to map; each has its size in bits.
+        slots: The available PDOs.
+        keep_order: Keep the order if possible, since a drive applies PDOs and their entries one after the other.
     """
     if keep_order:
         in_order = _fill_one_after_the_other(entries, slots)
         if in_order is not None:
             return in_order
-    # Widest first: then what fits at all is found soon.
+    # Widest first: a solution, if there is one, is then found soon.
     by_width = sorted(entries, key=lambda entry: -(entry.bits or 0))
     return _search(by_width, [[] for _ in slots.numbers], slots.entries)
 
@@ -54,7 +54,7 @@ def _search(entries: list[Entry], pdos: list[list[Entry]], limit: int) -> list[l
     for pdo in pdos:
         state = (len(pdo), sum(other.bits or 0 for other in pdo))
         if state in tried or not _fits(entries[0], pdo, limit):
-            continue  # a PDO as full as one that led nowhere leads nowhere
+            continue  # skip a PDO as full as one that led to no solution
         tried.add(state)
         pdo.append(entries[0])
         found = _search(entries[1:], pdos, limit)

@@ -42,7 +42,7 @@ class Network:
             port.subscribe(ERROR_CONTROL + node, partial(self._on_error_control, node))
 
     def move_emergencies(self, node: int, cob_id: int) -> None:
-        """Take emergencies of a node from the identifier that its 1014h says."""
+        """Receive a node's emergencies by the identifier in its 1014h."""
         if not cob_id & INVALID and cob_id & IDENTIFIER != EMCY + node:
             self._port.subscribe(EMCY + node, None)
             self._port.subscribe(cob_id & IDENTIFIER, partial(self._on_emergency, node))
@@ -76,7 +76,7 @@ class Network:
             )
 
     def take_emergencies(self) -> list[ReceivedEmergency]:
-        """Return and forget the emergencies that came, in their order."""
+        """Return and forget the received emergencies, in their order."""
         self._port.drain()
         taken, self._emergencies[:] = list(self._emergencies), []
         return taken
@@ -99,7 +99,7 @@ class Network:
 
 
 def check_nodes(nodes: Iterable[int]) -> tuple[int, ...]:
-    """Return node-IDs; ValueError for those that cannot be, are there twice, or for none."""
+    """Return the node-IDs; ValueError if one is impossible or given twice, or the list is empty."""
     found = tuple(nodes)
     wrong = [node for node in found if not 1 <= node <= MAX_NODE]
     if not found or wrong or len(set(found)) != len(found):

@@ -1,4 +1,4 @@
-"""Whether another master commands the nodes: frames that only a master sends, and that are not ours.
+"""Detects another master of the nodes by frames that only a master sends and that are not ours.
 
 A program receives every frame of the bus but its own, so a frame with such an identifier is from another master.
 """
@@ -25,7 +25,7 @@ class OtherMasters:
         nodes: Node-IDs that matter; RPDOs are those of the predefined connection set.
 
     Attributes:
-        heard: What was heard first, in words; "" as long as nothing was.
+        heard: Description of the first such frame; "" if there was none.
     """
 
     def __init__(self, port: Port, nodes: Sequence[int]) -> None:
@@ -39,7 +39,7 @@ class OtherMasters:
             port.subscribe(can_id, partial(self._hear, what))
 
     def listen(self, seconds: float) -> None:
-        """Listen, and nothing else.
+        """Listen for some seconds, without sending.
 
         Raises:
             OtherMastersError: If another master is heard.

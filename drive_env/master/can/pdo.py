@@ -1,4 +1,4 @@
-"""PDOs of one node: which there are, how objects are mapped to them, and how they were before."""
+"""PDOs of one node: which exist, how objects are mapped to them, and how they are restored."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from drive_env.master.can.borrowed_identifiers import BorrowedIdentifiers
 from drive_env.master.can.mapping import PDO_BITS, Slots, pack
 from drive_env.master.packing import Member
 
-# Transmission types of a TPDO (CiA 301, table 74): at each SYNC; with a SYNC at all.
+# Transmission types of a TPDO (CiA 301, table 74): at each SYNC; at a SYNC in any way.
 SYNC_EVERY, WITH_SYNC = 1, range(241)
-SYNCHRONOUS = (1, 0)  # types of an RPDO that waits for SYNC, of which some drives take one alone
+SYNCHRONOUS = (1, 0)  # types of an RPDO that waits for SYNC; some drives accept only one of them
 
 
 class Direction(NamedTuple):
@@ -47,7 +47,7 @@ class RemotePdo(NamedTuple):
 
 
 class _Before(NamedTuple):
-    """A PDO as it was found; of its mapping all entries that we write, also beyond the `in_use` that are in force."""
+    """A PDO as it was found, with all mapping entries that we overwrite, also those beyond the number in use."""
 
     number: int
     cob_id: int
@@ -63,7 +63,7 @@ def is_mappable(description: Description, entry: Entry, direction: Direction) ->
 
 
 def mappable_names(description: Description, direction: Direction) -> str:
-    """Return the mappable objects of a direction, as a message lists them."""
+    """Return the mappable objects of a direction as a list for messages."""
     known = description.dictionary
     return ", ".join(entry.label for entry in known if is_mappable(description, entry, direction)) or "none"
 
@@ -92,7 +92,7 @@ def _numbers(description: Description, direction: Direction) -> list[int]:
 
 
 def stands(description: Description, direction: Direction, number: int) -> bool:
-    """Return whether a PDO stays as it is: by the EDS identifier, mapping or a TPDO's type can only be read."""
+    """Return whether a PDO is fixed: its identifier, mapping or (for a TPDO) type is read-only by the EDS."""
     communication, mapping = direction.communication + number, direction.mapping + number
     kind = [(communication, 2)] if direction is OUT_OF_DRIVE else []
     keys = [key for key in ((communication, 1), (mapping, 0), (mapping, 1), *kind) if description.has(key)]
@@ -100,7 +100,7 @@ def stands(description: Description, direction: Direction, number: int) -> bool:
 
 
 def slots(description: Description, direction: Direction, axis: int) -> Slots:
-    """Return the PDOs that an axis may use: the node's that can be mapped anew, in equal shares."""
+    """Return the PDOs that an axis may use: the node's remappable ones, in equal shares."""
     known = description.dictionary
     there = [one for one in _numbers(description, direction) if not stands(description, direction, one)]
     share = len(there) // description.num_axes
@@ -116,7 +116,7 @@ def slots(description: Description, direction: Direction, axis: int) -> Slots:
 
 
 def plan(description: Description, entries: Sequence[Entry], direction: Direction) -> list[list[Entry]] | None:
-    """Return which entries each PDO of axis 0 takes, or None if they do not fit; other axes are alike."""
+    """Return the entries of each PDO of axis 0, or None if they do not fit; other axes are alike."""
     if not entries:
         return []
     return pack(entries, slots(description, direction, 0), keep_order=direction is INTO_DRIVE)
@@ -138,13 +138,13 @@ def too_many(description: Description, entries: Sequence[Entry], direction: Dire
 
 
 class PdoConfiguration:
-    """The PDOs of one node, configured over SDO and put back on demand.
+    """The PDOs of one node, configured over SDO and restored on demand.
 
     Args:
         node: Node-ID.
         sdo: The node's SDO client.
-        description: What device it is.
-        borrowed: Where PDOs of further axes have their identifiers from that have none.
+        description: Its device.
+        borrowed: Gives identifiers to PDOs of further axes that have none.
     """
 
     def __init__(self, node: int, sdo: ObjectClient, description: Description, borrowed: BorrowedIdentifiers) -> None:
@@ -154,16 +154,16 @@ class PdoConfiguration:
         self._borrowed = borrowed
         self._before: dict[tuple[str, int], _Before] = {}
         self._silenced: dict[int, int] = {}  # TPDO -> its COB-ID as it was found
-        self._quiet: set[int] = set()  # TPDOs that do not go with SYNC as they are
+        self._quiet: set[int] = set()  # TPDOs found not to go with SYNC
         self._standing: dict[str, tuple[RemotePdo, ...]] = {}
-        self._types: dict[int, int] = {}  # TPDO that stands but for its type -> its type as it was found
+        self._types: dict[int, int] = {}  # fixed TPDO whose type alone was changed -> its type as found
 
     def configure(self, groups: Sequence[Sequence[Entry]], direction: Direction) -> list[RemotePdo]:
         """Map entries of all axes, each group to a PDO that goes with SYNC, and return these PDOs.
 
-        PDOs of this direction that carried a mapping of ours and are not needed any more are put back. Other TPDOs that
-        go with SYNC, as the factory's may, are silent meanwhile: the SYNCs are ours, and each frame that was not asked
-        for holds up the next one for 0.1 ms.
+        PDOs of this direction that we had mapped and no longer need are restored. Other TPDOs that go with SYNC, as the
+        factory's may, are switched off meanwhile: the SYNCs are ours, and each unwanted frame delays the next one by
+        0.1 ms.
 
         Raises:
             ObjectAccessError: If the drive refuses; BusError if it gives the PDO no identifier.
@@ -183,9 +183,9 @@ class PdoConfiguration:
         return pdos
 
     def standing(self, direction: Direction) -> tuple[RemotePdo, ...]:
-        """Return the PDOs that are on and stay as they are, as far as our cycles can have them, as the drive has them.
+        """Return the fixed PDOs, as the drive has them, that are on and that our cycles can use.
 
-        Of a TPDO at every SYNC; a TPDO whose type can be written is given that.
+        A TPDO must go with every SYNC; it is set to that type if its type is writable.
         """
         if direction.name not in self._standing:
             numbers = [
@@ -196,7 +196,7 @@ class PdoConfiguration:
         return self._standing[direction.name]
 
     def _as_it_stands(self, direction: Direction, number: int) -> RemotePdo | None:
-        """Return a PDO as the drive has it; None for one that is off, or that our cycles cannot have."""
+        """Return a PDO as the drive has it; None if it is off or our cycles cannot use it."""
         before = self._look(direction, number)
         if before.cob_id & (INVALID | EXTENDED) or not before.in_use:
             return None
@@ -222,10 +222,10 @@ class PdoConfiguration:
         return RemotePdo(label, before.cob_id & IDENTIFIER, start, tuple(members))
 
     def restore(self) -> None:
-        """Put every PDO back as it was found.
+        """Restore every PDO as found.
 
         Raises:
-            BusError: If not all of them could be.
+            BusError: If not all of them could be restored.
         """
         found, self._before = self._before, {}
         tidying = Tidying()
@@ -249,7 +249,7 @@ class PdoConfiguration:
         self._types.clear()
 
     def _silence(self, used: set[int]) -> None:
-        """Switch off the TPDOs besides those in use that go with SYNC."""
+        """Switch off the TPDOs that go with SYNC, except those in use."""
         direction = OUT_OF_DRIVE
         for axis in range(self._description.num_axes):
             for number in slots(self._description, direction, axis).numbers:
@@ -292,7 +292,7 @@ class PdoConfiguration:
         return RemotePdo(label, can_id, start, tuple(members))
 
     def _usual_identifier(self, direction: Direction, number: int, axis: int) -> int:
-        """Return the identifier of a PDO that has none: the node's, or a borrowed one; 0 for a fifth PDO of an axis."""
+        """Return the default or borrowed identifier of a PDO that has none; 0 for a fifth PDO of an axis."""
         usual = direction.identifiers
         if number < len(usual):
             return usual[number] + self._node
@@ -314,7 +314,7 @@ class PdoConfiguration:
         )
 
     def _look_further(self, direction: Direction, before: _Before, entries: int) -> _Before:
-        """Return a PDO as it was found with so many entries of its mapping at least: ours overwrites them."""
+        """Return a PDO as found, with at least this many of its mapping entries, since ours overwrite them."""
         more = range(len(before.mapping) + 1, entries + 1)
         found = tuple(self._read(direction.mapping + before.number, sub) for sub in more)
         return before._replace(mapping=before.mapping + found)
@@ -322,7 +322,7 @@ class PdoConfiguration:
     def _put_back(self, direction: Direction, before: _Before) -> None:
         if direction is OUT_OF_DRIVE:
             self._quiet.discard(before.number)
-        # Entries that are not in use are parameters, too: a backup has them.
+        # Entries that are not in use are parameters, too: a backup contains them.
         self._write_all(
             direction, before.number, before.cob_id, (before.kind,), before.mapping, before.in_use, self._sdo.put_back
         )
@@ -339,7 +339,7 @@ class PdoConfiguration:
     ) -> None:
         """Remap in the order that CiA 301 demands: off, no entries, entries, their number, on.
 
-        Of the transmission types the first one is written that the drive takes.
+        The first transmission type that the drive accepts is used.
         """
         put = partial(self._put, write=write)
         communication = direction.communication + number
@@ -358,7 +358,7 @@ class PdoConfiguration:
         put(communication, 1, cob_id, 4)
 
     def _is_fixed(self, direction: Direction, number: int) -> bool:
-        """Return whether the type of an RPDO cannot be written: then it acts as it comes, just before SYNC."""
+        """Return whether the type of an RPDO is read-only: it then acts on arrival, just before SYNC."""
         kind = (direction.communication + number, 2)
         known = self._description
         return direction is INTO_DRIVE and known.has(kind) and known.dictionary.find(kind).access in ("ro", "const")

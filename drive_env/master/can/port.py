@@ -1,4 +1,4 @@
-"""The master's port to a bus: frames go out, frames come in, and a thread that waits for an identifier gets its data.
+"""The master's port to a bus: sends frames, receives frames, and gives their data to the thread that waits for them.
 
 There is no receiving thread: the thread that waits receives, so no frame passes a queue between threads. The bus
 (the kernel, the socket) keeps what arrives in the meantime. Two threads may wait at a time, the program's and the
@@ -23,14 +23,14 @@ from drive_env.master.can.slcan_socket import SlcanSocket
 Handler = Callable[[bytes], None]
 
 INTERFACE_VARIABLE, CHANNEL_VARIABLE = "DRIVE_ENV_INTERFACE", "DRIVE_ENV_CHANNEL"
-# No part of the channel, which messages, snapshots and certificates repeat, and no option of a command, which every
+# Not in the channel, which messages, snapshots and certificates contain, and not an option of a command, which every
 # user of the computer can read.
 TOKEN_VARIABLE = "DRIVE_ENV_TOKEN"
 MOST_FRAMES = 10_000
 SEND_TIMEOUT = 0.5  # [s]
 _LINE_TIME = 0.002  # for the rest of a frame that has begun to arrive (slcan: a line of text) [s]
-_ORPHANED = 0.05  # s for which the thread that has the turn does nothing with it
-_TURN = 0.0003  # how often a thread looks for what another one has received for it [s]
+_ORPHANED = 0.05  # s after which another thread takes over from the receiving thread if that does nothing
+_TURN = 0.0003  # interval at which a thread checks for frames that another one has received for it [s]
 _ADDRESS = re.compile(r"[\w.-]+:\d+")  # HOST:PORT
 
 
@@ -38,10 +38,10 @@ def open_bus(interface: str | None = None, channel: str | None = None, **options
     """Open a python-can bus.
 
     Args:
-        interface: As python-can names it; from DRIVE_ENV_INTERFACE if not given, slcan for a channel `socket://...`.
+        interface: The name in python-can; from DRIVE_ENV_INTERFACE if not given, slcan for a channel `socket://...`.
         channel: The channel; from DRIVE_ENV_CHANNEL if not given.
-        options: Whatever the interface takes besides, e.g. `bitrate`; `token` for a hub that asks for one (`drive-env
-            serve --token`), from DRIVE_ENV_TOKEN if not given.
+        options: Further options of the interface, e.g. `bitrate`; `token` for a hub that asks for one (`drive-env serve
+            --token`), from DRIVE_ENV_TOKEN if not given.
 
     Raises:
         OpenError: If it cannot be opened, with what to try.
@@ -104,7 +104,7 @@ class Port:
         self._file = _file_number(bus)
 
     def subscribe(self, can_id: int, handler: Handler | None) -> None:
-        """Have the data of every frame with this identifier handed to the handler; None ends that."""
+        """Call the handler with the data of every frame with this identifier; None ends that."""
         if handler is None:
             self._handlers.pop(can_id, None)
         else:
@@ -114,7 +114,7 @@ class Port:
         """Send a frame.
 
         Raises:
-            BusError: If the bus does not take it within half a second.
+            BusError: If the bus does not accept it within half a second.
         """
         message = can.Message(
             arbitration_id=can_id,
@@ -135,7 +135,7 @@ class Port:
     def receive(self, timeout: float = 0.0, done: Callable[[], bool] | None = None) -> bool:
         """Wait up to `timeout` [s] for a frame and hand it to its handler; False if none came.
 
-        While another thread receives, its frames count: `done` tells whether what is waited for has come by it.
+        While another thread receives, `done` returns whether that thread has received the awaited frame.
 
         Raises:
             BusError: If the bus is gone.
@@ -161,13 +161,13 @@ class Port:
         return True
 
     def drain(self) -> None:
-        """Process the received frames, without waiting (and not for ever, where more come than can be received)."""
+        """Process the received frames without waiting; ends even if frames arrive faster than they are processed."""
         for _ in range(MOST_FRAMES):
             if not self.receive():
                 return
 
     def wait(self, done: Callable[[], bool], timeout: float) -> bool:
-        """Receive until `done()` or until `timeout` [s] has passed; return done()."""
+        """Receive until `done()` is true or `timeout` [s] has passed; return done()."""
         deadline = time.monotonic() + timeout
         while not done():
             left = deadline - time.monotonic()
@@ -183,7 +183,7 @@ class Port:
             self._bus.shutdown()
 
     def _take_turn(self, timeout: float, done: Callable[[], bool] | None) -> bool:
-        """Become the thread that receives, within `timeout` [s]; False if another one is, or if `done`."""
+        """Become the receiving thread within `timeout` [s]; False if another one stays it, or if `done`."""
         if self._receiving.acquire(blocking=False):
             return True
         begun = time.monotonic()
@@ -192,7 +192,8 @@ class Port:
             if self._is_receiving:
                 idle_since = time.monotonic()
             elif time.monotonic() - idle_since > _ORPHANED and self._receiving.locked():
-                # Ctrl-C came to the other thread between its turn and its first instruction: no thread would receive.
+                # Ctrl-C hit the other thread between taking its turn and its first instruction: no thread would
+                # receive.
                 self._receiving.release()
             if (done is not None and done()) or time.monotonic() >= deadline:
                 return False
@@ -201,7 +202,7 @@ class Port:
     def _next(self, timeout: float) -> can.Message | None:
         if self._file is None:
             return self._bus.recv(timeout)
-        # python-can's slcan sleeps in steps of a millisecond; the file tells at once.
+        # python-can's slcan sleeps in steps of a millisecond; waiting on the file ends at once.
         if not select.select([self._file], [], [], timeout)[0]:
             return None
         return self._bus.recv(_LINE_TIME)

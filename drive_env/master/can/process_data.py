@@ -1,4 +1,4 @@
-"""Process data of several nodes in PDOs: objects of all axes to PDOs, and rows of integers to frames."""
+"""Process data of several nodes in PDOs: objects of all axes to PDOs, rows of integers to frames."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from mechanics.arrays import Integers
 
 
 class _Plan(NamedTuple):
-    """How objects are carried: the entries of each PDO that is mapped for them, and each node's PDOs that stand."""
+    """The mapping for some objects: the entries of each PDO mapped for them, and each node's fixed PDOs."""
 
     groups: list[list[Entry]]
     standing: list[list[RemotePdo]]
@@ -50,7 +50,7 @@ class RpdoRows:
         self._frames = [(can_id, [row.tobytes() for row in rows]) for can_id, rows in rpdos]
 
     def send(self, row: int) -> None:
-        """Send a row; the drives take it at the next SYNC."""
+        """Send a row; the drives apply it at the next SYNC."""
         for can_id, rows in self._frames:
             self._port.send(can_id, rows[row])
 
@@ -60,13 +60,13 @@ class PdoProcessData:
 
     Args:
         port: The bus.
-        description: What device the nodes are.
+        description: The nodes' device.
         configurations: The PDOs of each node.
         dry: A dry run: no drive is connected, and nothing is sampled.
-        bus_time: What the bus carries in a cycle.
+        bus_time: Capacity of the bus in a cycle.
 
     Attributes:
-        mapping: Its number: it grows with every change.
+        mapping: Number of the mapping, which grows with every change.
     """
 
     def __init__(
@@ -102,7 +102,7 @@ class PdoProcessData:
 
         Args:
             wanted: Objects to sample.
-            welcome: If PDOs and bus have room for it.
+            welcome: Objects to sample if PDOs and bus have room.
             played: Objects that are sent to the drives meanwhile.
 
         Raises:
@@ -120,11 +120,11 @@ class PdoProcessData:
             besides.pop()
 
     def is_mapped(self, played: tuple[Entry, ...], sampled: tuple[Entry, ...]) -> bool:
-        """Return whether the PDOs are such already: into the drive just these, out of it these and maybe others."""
+        """Return whether the PDOs carry exactly the played objects, and at least the sampled ones."""
         return (not played or played == self._entries(INTO_DRIVE)) and self._carries(sampled)
 
     def map(self, played: tuple[Entry, ...], sampled: tuple[Entry, ...]) -> None:
-        """Map entries of every axis to PDOs that go with SYNC, as far as they are not mapped.
+        """Map entries of every axis to PDOs that go with SYNC, unless they are already mapped.
 
         Raises:
             ObjectAccessError: If they do not fit, into PDOs or into a cycle of the bus, or a drive refuses them.
@@ -142,7 +142,7 @@ class PdoProcessData:
         return self._entries(OUT_OF_DRIVE)
 
     def outputs(self, played: Mapping[Entry, Integers]) -> RpdoRows | None:
-        """Return the frames of the mapped RPDOs, of integers of shape (cycles, num_axes); None if nothing is played."""
+        """Return the mapped RPDOs' frames of integers of shape (cycles, num_axes); None if nothing is played."""
         if not played:
             return None
         return RpdoRows(
@@ -167,13 +167,13 @@ class PdoProcessData:
             self._configurations[k].forget()
         self.mapping += 1
         self._mapped.clear()
-        self._plans.clear()  # what stands may have been changed back
+        self._plans.clear()  # fixed PDOs may have changed with the reset
 
     def restore(self, node: int) -> None:
-        """Put every PDO of a node back as it was found.
+        """Restore every PDO of a node.
 
         Raises:
-            BusError: If not all of them could be.
+            BusError: If not all of them could be restored.
         """
         self._configurations[node].restore()
 
@@ -208,9 +208,10 @@ class PdoProcessData:
     def _of_standing(
         self, direction: Direction, entries: tuple[Entry, ...]
     ) -> tuple[set[Entry], list[list[RemotePdo]]]:
-        """Return the entries that PDOs which stand carry of every axis, and these PDOs of each node.
+        """Return the entries that fixed PDOs carry for every axis, and these PDOs of each node.
 
-        What goes into a drive goes there whole: of an RPDO every object must be played, lest it bring an old command.
+        An RPDO is sent whole: it can be used only if every object in it is played, since others would bring an old
+        command.
         """
         usable = [
             [

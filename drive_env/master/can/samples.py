@@ -20,7 +20,7 @@ class PdoSamples:
 
     Args:
         port: The bus.
-        of_nodes: What to collect, node by node.
+        of_nodes: The PDOs to collect, node by node.
         axes_per_node: Axes of a node.
     """
 
@@ -29,7 +29,7 @@ class PdoSamples:
         self._of_nodes = of_nodes
         self._axes_per_node = axes_per_node
         self._pdos = pdos = [pdo for of_node in of_nodes for pdo in of_node]
-        port.drain()  # what an earlier run left behind belongs to its SYNCs
+        port.drain()  # frames of an earlier run belong to its SYNCs
         self.frames: list[list[bytes]] = [[] for _ in pdos]
         for pdo, frames in zip(pdos, self.frames, strict=True):
             port.subscribe(pdo.can_id, frames.append)
@@ -54,7 +54,7 @@ class PdoSamples:
         return values
 
     def close(self) -> None:
-        """Take nothing more."""
+        """Stop collecting."""
         for pdo in self._pdos:
             self._port.subscribe(pdo.can_id, None)
 

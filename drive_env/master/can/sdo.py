@@ -1,8 +1,8 @@
-"""The SDO client of one node: python-canopen's transfers on our port, with a time-out for each.
+"""The SDO client of one node: python-canopen's transfers on our port, each with a time-out.
 
-What differs from python-canopen's client: the thread that waits also receives; answers that belong to an earlier
-transfer are passed over; a transfer ends when its node boots, which has forgotten it; an abort names its object; many
-bytes go in blocks (block_transfer.py) where the node's server has them, which the first refusal tells.
+Differences from python-canopen's client: the waiting thread also receives; answers to an earlier transfer are ignored;
+a transfer ends when its node boots, since the node has forgotten it; an abort names its object; long values go in
+blocks (block_transfer.py) until the node's server refuses one.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from drive_env.master.can.port import Port
 _ABORT = 0x80
 _INITIATE = (0x40, 0x60)  # upload and download responses that name their object, upper three bits
 _TIMED_OUT, _GENERAL = 0x05040000, 0x08000000
-_NO_BLOCKS = (UNKNOWN_COMMAND, UNSUPPORTED_ACCESS)  # what servers without block transfers answer
-BUSY_TIME = 0.5  # s for which a controller's buffer may be full of segments
+_NO_BLOCKS = (UNKNOWN_COMMAND, UNSUPPORTED_ACCESS)  # answers of servers without block transfers
+BUSY_TIME = 0.5  # s during which a controller's buffer may be full of segments
 PRE_OPERATIONAL = 0x80  # NMT command (CiA 301, 7.2.8.3.1)
-TWICE = 2  # transfers that must be answered twice: one frame may be repeated
-RECENT = 8  # transfers whose second answer may come yet
-PATIENT = 4.0  # times as long as usual is waited for what should not be left undone
+TWICE = 2  # transfers that must be answered twice to prove two nodes: a single frame may be repeated
+RECENT = 8  # transfers whose second answer may still come
+PATIENT = 4.0  # times the usual wait, for writes that restore a value
 
 
 class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not typed
@@ -46,8 +46,8 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
         alive: Called while an answer is waited for.
 
     Attributes:
-        is_new: The node may be two with one node-ID: a transfer is refused once that is seen.
-        answered_twice: Transfers to which an answer came when they had theirs.
+        is_new: Whether two nodes may have this node-ID: transfers are refused once that is detected.
+        answered_twice: Number of transfers that got a second answer.
     """
 
     def __init__(self, port: Port, node: int, alive: Callable[[], None] = lambda: None) -> None:
@@ -56,14 +56,14 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
         self._node = node
         self._alive = alive
         self._answers: list[bytes] = []
-        self._may_be_stopped = False  # by missed heartbeats, and has not answered since
+        self._may_be_stopped = False  # by missed heartbeats; it has not answered since
         self._has_booted: bool  # since the transfer under way began
-        self._has_blocks = True  # as far as is known
-        self._in_block = False  # every frame is of the block transfer under way
+        self._has_blocks = True  # until the server refuses a block transfer
+        self._in_block = False  # every frame belongs to the block transfer under way
         self._object: tuple[int, int]  # of the transfer under way
-        self._timeout: float  # and its time for an answer [s]
-        self._recent: deque[tuple[int, int]] = deque(maxlen=RECENT)  # objects of transfers that had their answer
-        self._has_retried = False  # so that an answer which comes late is no second one
+        self._timeout: float  # its time-out for an answer [s]
+        self._recent: deque[tuple[int, int]] = deque(maxlen=RECENT)  # objects of answered transfers
+        self._has_retried = False  # then a late answer is not a second one
         self.is_new = False
         self.answered_twice = 0
         self._turn = threading.RLock()  # one transfer at a time: the supervisor's thread looks at the drive, too
@@ -82,19 +82,19 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
             return self._transfer(index, sub, None, f"the read of {label}", timeout)
 
     def write(self, index: int, sub: int, data: bytes, label: str, timeout: float) -> None:
-        """Write the bytes of an object. It is not tried twice: a repeated write may mean something else.
+        """Write the bytes of an object, once: a repeated write may mean something else.
 
         Raises:
             ObjectAccessError: With the abort code, if the drive refuses.
-            NoAnswerError: If it does not answer within `timeout` [s]; the drive may have taken the value or not.
+            NoAnswerError: If it does not answer within `timeout` [s]; the drive may or may not have applied the value.
         """
         self._transfer(index, sub, data, f"the write of {label}", timeout)
 
     def put_back(self, index: int, sub: int, data: bytes, label: str, timeout: float) -> None:
-        """Write an object's value of before; without an answer it is written once more, with a longer wait.
+        """Write an object's previous value; without an answer once more, with a longer wait.
 
-        A node that has missed its master's heartbeats may be stopped, where it answers no SDO: it is woken first, into
-        pre-operational.
+        A node that has missed its master's heartbeats may be stopped and then answers no SDO: it is set to
+        pre-operational first.
 
         Raises:
             ObjectAccessError: With the abort code, if the drive refuses.
@@ -107,7 +107,7 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
             self.write(index, sub, data, label, PATIENT * timeout)
 
     def ask(self, index: int, sub: int, timeout: float) -> bytes | None:
-        """Return the bytes of a short object if they come within `timeout` [s], the wait for one's turn included."""
+        """Return the bytes of a short object; None after `timeout` [s], which include the wait for one's turn."""
         deadline = time.monotonic() + timeout
         if not self._turn.acquire(timeout=timeout):
             return None
@@ -119,32 +119,32 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
             self._turn.release()
 
     def command(self, index: int, sub: int, data: bytes) -> None:
-        """Send a short write without waiting: neither for an answer nor for a transfer that is under way.
+        """Send a short write without waiting, neither for its answer nor for the transfer under way.
 
         Raises:
-            BusError: If the bus does not take the frame.
+            BusError: If the bus does not accept the frame.
         """
-        if self._in_block:  # or a server that takes segments would take it for one
+        if self._in_block:  # a server that expects segments would take the request for one
             self.abort(_GENERAL)
         self.send_request(struct.pack("<BHB", 0x23 | (4 - len(data)) << 2, index, sub) + data.ljust(4, b"\0"))
 
     def forget(self) -> None:
-        """End the transfer that is under way: the node has booted, and knows nothing of it."""
+        """End the transfer under way: the node has booted and forgotten it."""
         self._has_booted = True
 
     def may_be_stopped(self) -> None:
-        """Note that the node missed this master's heartbeats: where that stops it, it answers no SDO."""
+        """Note that the node missed this master's heartbeats: if that stops it, it answers no SDO."""
         self._may_be_stopped = True
 
     def check_alone(self) -> None:
-        """Raise BusError where two nodes have answered under this node-ID."""
+        """Raise BusError if two nodes have answered under this node-ID."""
         self._port.drain()
         self._count_seconds(self._answers)
         if self.answered_twice >= TWICE:
             raise BusError(several_answer(2, self._node))
 
     def _count_seconds(self, answers: list[bytes]) -> None:
-        """Note answers to transfers that had theirs, and forget them all."""
+        """Count answers to transfers that were already answered; empties `answers`."""
         while answers:
             answer = answers.pop(0)
             if len(answer) == 8 and (answer[0] == _ABORT or answer[0] & 0xE0 in _INITIATE):
@@ -197,17 +197,17 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
             ) from None
 
     def _take_for_answered(self) -> None:
-        """Note that a transfer had its answer, unless that of the one before may be late."""
+        """Note that a transfer was answered, unless the previous one's answer may still be late."""
         if not self._has_retried:
             self._recent.append(self._object)
         self._has_retried = self._may_be_stopped = False
 
     def _read(self, index: int, sub: int) -> bytes:
-        """Read short values in segments, and in blocks those that the server says to be long."""
+        """Read short values in segments, and values that the server reports as long in blocks."""
         with ReadableStream(self, index, sub) as stream:
             if stream.exp_data is not None or (stream.size or 0) < BLOCK_FROM or not self._has_blocks:
                 return bytes(stream.read())
-        self.abort(_GENERAL)  # of the transfer in segments
+        self.abort(_GENERAL)  # ends the transfer in segments
         try:
             initiated = self._begin_block(block_transfer.upload_request(index, sub), block_transfer.is_upload)
         except NoBlockTransferError:
@@ -232,7 +232,7 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
         """Return the answer to a request that begins a block transfer.
 
         Raises:
-            NoBlockTransferError: If the server has none; from now on it is not asked again.
+            NoBlockTransferError: If the server has no block transfer; it is not asked again.
         """
         try:
             with self._all_frames():
@@ -252,7 +252,7 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
 
     @contextmanager
     def _all_frames(self) -> Iterator[None]:
-        """Take every frame of the server for one of this transfer: segments name no object."""
+        """Assign every frame of the server to this transfer: segments name no object."""
         self._in_block = True
         try:
             yield
@@ -265,7 +265,7 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
         self._port.send(self.rx_cobid, bytes(request))
 
     def send_patiently(self, request: bytes) -> None:
-        """Send a frame, and try again for a while: a controller's buffer may be full of those before."""
+        """Send a frame, repeatedly for a while: a controller's buffer may be full of earlier frames."""
         end = time.monotonic() + BUSY_TIME
         while True:
             try:
@@ -324,7 +324,7 @@ class SdoClient(CanopenClient):  # type: ignore[misc]  # python-canopen is not t
 
 
 def several_answer(count: int, node: int) -> str:
-    """Return, for a message, that several nodes have one node-ID."""
+    """Return the text of a message that several nodes have one node-ID."""
     return (
         f"{'two' if count == 2 else count} nodes answer as {node}: switch all but one of them off, and give it another "
         "node-ID, with `drive-env lss` or by its own object; if another master has read the same just then, try again"

@@ -1,7 +1,7 @@
 """The client of an slcan adapter over TCP, such as `drive-env serve`.
 
-python-can's own reads byte by byte with a system call or two for each: 475 us of processor time for a cycle with two
-TPDOs, where this one takes a quarter of it. It is a python-can bus all the same.
+python-can's client reads byte by byte with one or two system calls each: 475 us of processor time for a cycle with two
+TPDOs; this one takes a quarter of it. It is a python-can bus, too.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ class SlcanSocket(can.BusABC):  # type: ignore[misc]  # python-can is not typed 
     Args:
         channel: The address.
         bitrate: Bit rate to set [bit/s]; by default the adapter's.
-        token: What a hub that is open to the network asks for. One that asks for none is joined all the same.
+        token: The token that a hub open to the network requires; ignored by a hub that requires none.
 
     Raises:
         OpenError: For an invalid address, bit rate or token, the wrong token, or no hub at the address; in receiving,
-            if the hub asks for a token and none was given.
+            if the hub requires a token and none was given.
     """
 
     def __init__(self, channel: str, bitrate: int | None = None, token: str | None = None) -> None:
@@ -55,7 +55,7 @@ class SlcanSocket(can.BusABC):  # type: ignore[misc]  # python-can is not typed 
         """Send a frame.
 
         Raises:
-            can.CanOperationError: If the other end is gone or takes nothing within `timeout` [s].
+            can.CanOperationError: If the other end is gone or accepts nothing within `timeout` [s].
         """
         kind = ("R" if msg.is_extended_id else "r") if msg.is_remote_frame else ("T" if msg.is_extended_id else "t")
         can_id = f"{msg.arbitration_id:08X}" if msg.is_extended_id else f"{msg.arbitration_id:03X}"
@@ -75,7 +75,7 @@ class SlcanSocket(can.BusABC):  # type: ignore[misc]  # python-can is not typed 
         return (self._frames.popleft() if self._frames else None), False
 
     def _read(self, timeout: float | None) -> None:
-        """Read the received bytes, after waiting for some."""
+        """Read the received bytes, waiting up to `timeout` [s] for some."""
         try:
             if timeout == 0.0 or select.select([self._socket], [], [], timeout)[0]:
                 data = self._socket.recv(_CHUNK)
@@ -133,12 +133,12 @@ def _connect(channel: str) -> socket.socket:
 
 
 def _present(token: str, connection: socket.socket, channel: str) -> None:
-    """Show a token before anything else, and wait for the answer; the connection is closed if it is not taken."""
+    """Send the token first and wait for the answer; the connection is closed if it is not accepted."""
     try:
         check_token(token)
         connection.sendall(b"K" + token.encode() + b"\r")
         answer = b""
-        while answer in (b"", TOKEN_WANTED[:1], TOKEN_WANTED):  # what else comes is "yes", or of who asks for none
+        while answer in (b"", TOKEN_WANTED[:1], TOKEN_WANTED):  # else "yes", or a hub without token
             data = connection.recv(_CHUNK)
             if not data:
                 raise ConnectionResetError
@@ -161,7 +161,7 @@ def _present(token: str, connection: socket.socket, channel: str) -> None:
 
 
 def _parse(line: bytes, now: float) -> can.Message | None:
-    """Return the frame of a line; None for other lines, as answers to commands are."""
+    """Return the frame of a line; None for other lines, such as answers to commands."""
     if line[:1] not in (b"t", b"T", b"r", b"R"):
         return None
     extended, remote = line[:1] in (b"T", b"R"), line[:1] in (b"r", b"R")

@@ -1,8 +1,8 @@
-"""Distributed clocks, as a master sets them: delays and offsets in a line, SYNC0, when frames go (ETG.1000.4, 6.8).
+"""Distributed clocks as set by a master: delays and offsets in a line, SYNC0, time of frames (ETG.1000.4, 6.8).
 
 The first slave is the reference: its system time goes through all others with every frame of process data, and each
-corrects its clock by it. SYNC0 comes at whole multiples of its cycle in that time, and frames go in the middle between
-two pulses: one that is early or late by less than half a cycle is there in time.
+corrects its clock by it. SYNC0 comes at whole multiples of its cycle in that time, and frames are sent in the middle
+between two pulses: one that is early or late by less than half a cycle arrives in time.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ HAS_CLOCKS = 0x04  # of the features, 0008h
 FEATURES = 0x0008
 OFF, SYNC0_ON, SYNC1_ON = 0x00, 0x03, 0x04  # of the activation, 0981h
 TOO_LATE = 0x04  # of the activation's status, 0984h: the start time had passed
-AHEAD = 0.1  # s from the look at the reference's time to the first pulse, as SOEM has it
+AHEAD = 0.1  # s from reading the reference's time to the first pulse, as in SOEM
 LATEST_START = 3.0  # s
 WORD = 1 << 32
 TURN = 1 << 64
@@ -35,18 +35,18 @@ def check_clocks(master: EtherCatMaster, positions: Sequence[int]) -> None:
 
 
 def delays_in_a_line(received: Sequence[tuple[int, int]]) -> list[int]:
-    """Return how long a frame takes from the first slave to each [ns].
+    """Return the delay of a frame from the first slave to each [ns].
 
     Args:
-        received: Of each slave, the local times [ns] at which a frame came to port 0, and back to port 1; both the same
-            for the last one.
+        received: For each slave, the local times [ns] at which a frame arrived at port 0, and returned to port 1; equal
+            for the last slave.
     """
     loops = [(back - forth) % WORD for forth, back in received]
     return [(loops[0] - loop) // 2 for loop in loops]
 
 
 def set_offsets(master: EtherCatMaster, count: int) -> None:
-    """Set delay and offset of each slave by the receive times that a frame has just left in it.
+    """Set delay and offset of each slave by the receive times that a frame has just left there.
 
     Raises:
         NoAnswerError: If a slave does not answer.
@@ -69,9 +69,9 @@ def start_sync0(master: EtherCatMaster, positions: Sequence[int], clock: Sync0) 
     """Start SYNC0 of slaves at the same whole multiple of its cycle [s].
 
     Args:
-        master: Of the segment.
-        positions: Slaves, which are in Pre-Op.
-        clock: Cycle; in lockstep time stands still meanwhile, and the first pulse is that of the next cycle.
+        master: The segment's master.
+        positions: Slaves in Pre-Op.
+        clock: Its cycle; in lockstep no time passes meanwhile, and the first pulse is that of the next cycle.
 
     Raises:
         BusError: If a slave's clock does not start.
@@ -101,10 +101,10 @@ def start_sync0(master: EtherCatMaster, positions: Sequence[int], clock: Sync0) 
 
 
 class FramePhase:
-    """When frames go, so that they come in the middle between two pulses of SYNC0.
+    """Times frames so that they arrive in the middle between two pulses of SYNC0.
 
     Args:
-        cycle: Of SYNC0 [s].
+        cycle: Cycle of SYNC0 [s].
     """
 
     def __init__(self, cycle: float) -> None:
@@ -112,11 +112,11 @@ class FramePhase:
         self._seen: tuple[float, int] | None = None
 
     def take(self, system_time: int) -> None:
-        """Learn the reference's time [ns], which a frame has just brought."""
+        """Note the reference's time [ns], which a frame has just brought."""
         self._seen = (time.perf_counter(), system_time)
 
     def wait(self, due: float) -> float:
-        """Return how much later than `due` [s, of perf_counter] the next frame should go [s]: below a cycle."""
+        """Return the delay [s], below a cycle, of the next frame after `due` [s, of perf_counter]."""
         if self._seen is None:
             return 0.0
         at, system = self._seen

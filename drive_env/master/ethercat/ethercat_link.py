@@ -20,19 +20,19 @@ from drive_env.master.ethercat.process_watchdog import FACTORY, ProcessWatchdog
 from drive_env.master.ethercat.slave_objects import SlaveObjects
 from drive_env.master.ethercat.state_names import state_name
 
-TIME_LOOK = 0.012  # s for which a drive in lockstep must stand still
+TIME_LOOK = 0.012  # s during which a drive in lockstep must not move on
 BOOT = 10.0  # s for a slave that is reset to come back
 LOOK = 0.001  # s
 
 
 class OtherEtherCatMasters:
-    """Tells whether another master has taken the slaves: their states are not those that this one gave them."""
+    """Detects another master of the slaves: their states are not those that this one set."""
 
     def __init__(self, link: EtherCatLink) -> None:
         self._link = link
 
     def check(self) -> None:
-        """Raise BusError if a slave is in another state than this program took it to."""
+        """Raise BusError if a slave is in another state than the one set by this program."""
         link = self._link
         given = AlState.PRE_OP if link.process.missing else AlState.OP
         for position, now in zip(link.nodes, link.states(), strict=True):
@@ -48,12 +48,12 @@ class EtherCatLink:
     """Slaves of one device on a segment.
 
     Args:
-        master: Of the segment; it is closed by `close`, and where this fails.
+        master: The segment's master; closed by `close`, and if the constructor fails.
         nodes: Positions of the slaves.
-        description: What device they are.
-        lockstep: Time passes by frames with process data alone.
-        sync0: Outputs take effect with SYNC0 of the distributed clocks, once in each of the description's cycles; with
-            SYNC1, at the same times, of devices that use it.
+        description: Their device.
+        lockstep: Time passes only with frames of process data.
+        sync0: Outputs take effect with SYNC0 of the distributed clocks, once in each of the description's cycles; for
+            devices that use SYNC1, with SYNC1 at the same times.
 
     Raises:
         BusError: If there are no slaves, or fewer than named.
@@ -118,19 +118,19 @@ class EtherCatLink:
         return self._clients[node]
 
     def wake(self, node: int) -> None:
-        """Take a node to where its mailbox answers."""
+        """Take a node to a state in which its mailbox answers."""
         status = self._master.status(self.nodes[node])
         if status.state not in (AlState.PRE_OP, AlState.SAFE_OP, AlState.OP):
             self._recover(node)
 
     def welcome(self, node: int) -> None:
-        """Do nothing: all that the link must know of a node its EEPROM has said."""
+        """Do nothing: the link has read a node's data from its EEPROM."""
 
     def start(self) -> None:
-        """Take the nodes to Op; those that have lost their images get them anew.
+        """Take the nodes to Op; nodes that have lost their images get them anew.
 
         Raises:
-            BusError: If one does not come; NoAnswerError if it does not answer.
+            BusError: If one does not reach Op; NoAnswerError if it does not answer.
         """
         with self.process.turn:
             for k, position in enumerate(self.nodes):
@@ -165,11 +165,11 @@ class EtherCatLink:
         return [self._master.status(position).state for position in self.nodes]
 
     def take_emergencies(self) -> list[ReceivedEmergency]:
-        """Return and forget the emergencies that came, in their order."""
+        """Return and forget the received emergencies, in their order."""
         return [one for one in self._master.take_emergencies() if one.node in self.nodes]
 
     def time_passes(self) -> bool | None:
-        """Return whether the first slave's clock goes while no process data are exchanged; None without a clock."""
+        """Return whether the first slave's clock runs while no process data are exchanged; None without a clock."""
         before = self._master.register(self.nodes[0], registers.SYSTEM_TIME, 8)
         time.sleep(TIME_LOOK)
         after = self._master.register(self.nodes[0], registers.SYSTEM_TIME, 8)
@@ -183,8 +183,8 @@ class EtherCatLink:
     def hand_out(self, words: Sequence[tuple[int, Key, bytes]]) -> None:
         """Put controlwords of several axes into the images, all of which go out in one frame.
 
-        Their transfers alone would be some frames apart, in which one axis turns what its twin does not hold yet. In
-        lockstep these take no time.
+        By separate transfers, some frames apart, one axis would turn before its twin is held. In lockstep such
+        transfers take no time.
         """
         if any(cia402.may_enable(int.from_bytes(data, "little")) for _, _, data in words):
             self.start()
@@ -199,13 +199,13 @@ class EtherCatLink:
         self.process.settle(self._frame)
 
     def receive(self, timeout: float = 0.0) -> bool:
-        """Wait: images come back with the exchange."""
+        """Wait: images return only with the exchange."""
         if timeout > 0.0:
             time.sleep(timeout)
         return False
 
     def wait(self, done: Callable[[], bool], timeout: float) -> bool:
-        """Exchange the images of a cycle once more where they did not come back, until `done()` or so long [s]."""
+        """Exchange lost images of a cycle again, until `done()` is true or `timeout` [s] has passed; return done()."""
         deadline = time.monotonic() + timeout
         while not done():
             if time.monotonic() > deadline:
@@ -215,19 +215,19 @@ class EtherCatLink:
         return True
 
     def drain(self) -> None:
-        """Do nothing: answers are taken with the exchange."""
+        """Do nothing: answers come with the exchange."""
 
     def close(self) -> None:
-        """Take all slaves to Init and let go of the segment."""
+        """Take all slaves to Init and close the segment."""
         self._master.close()
 
     # --- inside -----------------------------------------------------------------------------------------------------
     def _while_waiting(self) -> None:
-        """Say that the program waits, and keep the watchdogs quiet meanwhile."""
+        """Reset the stall timer of the program, and feed the watchdogs while it waits."""
         self._alive()
         if self._lockstep or time.monotonic() - self.process.exchanged_at <= FACTORY / 3.0:
             return
-        # The thread that has the images may be waiting for this mailbox; the other one must not wait for them.
+        # The thread that holds the images may be waiting for this mailbox; this one must not wait for the images.
         if self.process.turn.acquire(blocking=False):
             try:
                 self.process.exchange(is_cycle=False)
@@ -235,7 +235,7 @@ class EtherCatLink:
                 self.process.turn.release()
 
     def _recover(self, node: int) -> None:
-        """Take a node to Pre-Op; tell of one that has restarted by itself."""
+        """Take a node to Pre-Op; report one that has restarted by itself."""
         if self._master.recover(self.nodes[node]):
             self.process.forget([node])
             self._restarted(node)

@@ -1,7 +1,7 @@
 """The interface of a master under the link over EtherCAT: slaves, states, objects over CoE, exchange of images.
 
-There are two: `soem_master.py` has SOEM do it, for network interfaces; `frame_master.py` does it by itself, for
-whatever carries frames as bytes: UDP, or a segment of the same process.
+There are two: `soem_master.py` uses SOEM, for network interfaces; `frame_master.py` is our own, for anything that
+carries frames as bytes: UDP, or a segment of the same process.
 
 Slaves are named by their position in the line, from 0.
 """
@@ -15,11 +15,11 @@ from drive_env.ethercat.application import AlState, AlStatusCode
 from drive_env.fieldbus.link import ReceivedEmergency
 
 STATE, ERROR = 0x0F, 0x10  # of AL status
-READS = 5  # of a register, before its slave is taken to be silent: a frame may be lost
+READS = 5  # of a register, before its slave counts as silent: a frame may be lost
 
 
 class SlaveStatus(NamedTuple):
-    """AL status and AL status code of a slave; state 0: it does not answer at its address."""
+    """AL status and AL status code of a slave; state 0 if it does not answer at its address."""
 
     state: int
     has_error: bool
@@ -46,14 +46,14 @@ class SlaveIdentity(NamedTuple):
 
 
 class ImageSizes(NamedTuple):
-    """Bytes of a slave's images: outputs, which it takes, and inputs, which it gives."""
+    """Bytes of a slave's images: outputs, which it receives, and inputs, which it sends."""
 
     outputs: int
     inputs: int
 
 
 class Sync0(NamedTuple):
-    """Cycle of SYNC0 [s]; whether time passes by frames alone, so that its first pulse is that of the next cycle.
+    """Cycle of SYNC0 [s]; whether time passes only with frames, so that the first pulse is that of the next cycle.
 
     With `sync1`, SYNC1 comes at the same times.
     """
@@ -68,8 +68,8 @@ class EtherCatMaster(Protocol):
 
     Attributes:
         alive: Called again and again while an answer is waited for.
-        clock: What `map` sets the distributed clocks to; None: nothing.
-        system_time: The reference's time that the last exchange has brought [ns]; None: it has brought none.
+        clock: Settings of the distributed clocks for `map`; None: not used.
+        system_time: The reference's time from the last exchange [ns]; None if it brought none.
     """
 
     alive: Callable[[], None]
@@ -77,17 +77,17 @@ class EtherCatMaster(Protocol):
     system_time: int | None
 
     def begin(self) -> int:
-        """Find the slaves, give them addresses, take them to Pre-Op; whatever they did before ends. Returns how many.
+        """Find the slaves, give them addresses, and take them to Pre-Op, from any state. Returns their number.
 
         Raises:
-            BusError: If there is no slave, or one does not come to Pre-Op.
+            BusError: If there is no slave, or one does not reach Pre-Op.
         """
 
     def recover(self, position: int) -> bool:
-        """Take a slave from wherever it is to Pre-Op; return whether it had restarted, and had no address.
+        """Take a slave from any state to Pre-Op; return whether it had restarted, and so lost its address.
 
         Raises:
-            BusError: If it does not come.
+            BusError: If it does not reach Pre-Op.
         """
 
     def identity(self, position: int) -> SlaveIdentity:
@@ -97,31 +97,31 @@ class EtherCatMaster(Protocol):
         """Return a slave's state, asked now."""
 
     def map(self, sizes: Mapping[int, ImageSizes]) -> None:
-        """Give the images of slaves their places, and take the slaves from Pre-Op to Safe-Op.
+        """Assign addresses to the images of slaves, and take the slaves from Pre-Op to Safe-Op.
 
         Raises:
             BusError: If one refuses, with its AL status code.
         """
 
     def operate(self, positions: Sequence[int], exchange: Callable[[], None] | None, timeout: float) -> None:
-        """Take slaves to Op; `exchange` sends images meanwhile, as some want them before.
+        """Take slaves to Op; `exchange` sends images meanwhile, since some slaves need them before.
 
         Raises:
-            BusError: If one refuses, or does not come within `timeout` [s].
+            BusError: If one refuses, or does not reach Op within `timeout` [s].
         """
 
     def leave_op(self, position: int) -> None:
         """Take a slave to Pre-Op.
 
         Raises:
-            BusError: If it does not come.
+            BusError: If it does not reach Pre-Op.
         """
 
     def exchange(self, outputs: Sequence[bytes], timeout: float) -> list[bytes | None]:
-        """Send the images of the slaves that are mapped and return theirs, in the order of `map`.
+        """Send the images of the mapped slaves and return their answers, in the order of `map`.
 
         Returns:
-            None of a slave that is not in Op; of all if the frame does not come back, or one has not had its part.
+            None for a slave that is not in Op; None for all if the frame is lost or a slave has not handled its part.
         """
 
     def upload(self, position: int, index: int, sub: int, timeout: float) -> bytes:
@@ -138,17 +138,17 @@ class EtherCatMaster(Protocol):
         """Send a short write, without waiting for an answer or for a transfer that is under way."""
 
     def register(self, position: int, address: int, size: int) -> bytes | None:
-        """Return a slave's register; None where it does not answer."""
+        """Return a slave's register; None if it does not answer."""
 
     def write_register(self, position: int, address: int, data: bytes) -> None:
         """Write a slave's register.
 
         Raises:
-            NoAnswerError: If it does not take it.
+            NoAnswerError: If it does not accept it.
         """
 
     def take_emergencies(self) -> list[ReceivedEmergency]:
-        """Return and forget the emergencies that came; nodes are positions."""
+        """Return and forget the received emergencies; their nodes are positions."""
 
     def close(self) -> None:
-        """Take all slaves to Init, as far as they answer, and let go of the bus."""
+        """Take all slaves to Init, as far as they answer, and close the bus."""

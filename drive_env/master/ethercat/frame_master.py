@@ -1,6 +1,6 @@
-"""A master of its own, over whatever carries frames as bytes: states, mailbox and images by datagrams (ETG.1000.4).
+"""Our own master, over anything that carries frames as bytes: states, mailbox and images by datagrams (ETG.1000.4).
 
-It is small: slaves in a line, one image of each direction. SOEM (`soem_master.py`) has more, and wants a network
+It is small: slaves in a line, one image per direction. SOEM (`soem_master.py`) can do more, but needs a network
 interface.
 """
 
@@ -28,12 +28,12 @@ C = DatagramCommand
 FIRST_STATION, LOGICAL = 0x1001, 0x10000
 FRAME = 0.02  # s for a frame to come back
 PATIENCE = 5.0  # s for a state, and for the EEPROM
-TRIES = 50  # of a frame that does not come back
+TRIES = 50  # of a frame that is lost
 LOOK = 0.001  # s between two looks at a state
 SII_BUSY = 0x8000
 IDENTITY_WORD, MAILBOX_WORD, FIRST_CATEGORY, SYNC_MANAGER_CATEGORY, END = 0x08, 0x18, 0x40, 41, 0xFFFF
-LAST_WORD = 16_384  # of an EEPROM, where a list without an end is given up
-LONGEST_IMAGE = 1400  # bytes of all slaves in one frame
+LAST_WORD = 16_384  # of an EEPROM, at which reading a list without an end stops
+LONGEST_IMAGE = 1400  # bytes of all slaves' images in one frame
 
 
 class SlavePlaces(NamedTuple):
@@ -47,16 +47,16 @@ class SlavePlaces(NamedTuple):
 
 
 class FrameMaster:
-    """A master over a way.
+    """A master over a carrier of frames.
 
     Args:
-        way: Carries its frames.
-        frame_timeout: Longest wait for one to come back [s].
+        way: The carrier.
+        frame_timeout: Longest wait for a frame's return [s].
 
     Attributes:
         alive: Called again and again while an answer is waited for.
-        clock: What `map` sets the distributed clocks to.
-        system_time: The reference's time that the last exchange has brought [ns].
+        clock: Settings of the distributed clocks for `map`.
+        system_time: The reference's time from the last exchange [ns].
     """
 
     def __init__(self, way: FrameWay, frame_timeout: float = FRAME) -> None:
@@ -69,12 +69,12 @@ class FrameMaster:
         self._turn = threading.RLock()  # a frame and its answer
         self._places: list[SlavePlaces] = []
         self._mailboxes: list[MailboxClient] = []
-        self._repeats: dict[int, bool] = {}  # position -> whether its last message was asked for again, by turns
+        self._repeats: dict[int, bool] = {}  # position -> repeat-request bit of its mailbox, toggled each time
         self._mapped: dict[int, tuple[int, ImageSizes]] = {}  # position -> logical address, sizes
 
     # --- frames -----------------------------------------------------------------------------------------------------
     def _transfer(self, asked: Sequence[Datagram], timeout: float) -> list[Datagram] | None:
-        """Return the datagrams of a frame as they come back, None if it does not."""
+        """Return the datagrams of a frame as it returns; None if it is lost."""
         with self._turn:
             self._number = (self._number + 1) & 0xFF
             sent = [one._replace(number=self._number) for one in asked]
@@ -95,10 +95,10 @@ class FrameMaster:
         return None if found is None else found[0]
 
     def _surely(self, command: int, station: int, address: int, data: bytes, what: str) -> bytes:
-        """Repeat a datagram that may be done twice until a slave has had it.
+        """Repeat an idempotent datagram until a slave has handled it.
 
         Raises:
-            NoAnswerError: If none has.
+            NoAnswerError: If no slave handles it.
         """
         for _ in range(TRIES):
             found = self._one(command, station, address, data)
@@ -114,7 +114,7 @@ class FrameMaster:
         return self._surely(C.FPRD, FIRST_STATION + position, address, bytes(size), f"position {position}")
 
     def register(self, position: int, address: int, size: int) -> bytes | None:
-        """Return a slave's register; None where it does not answer."""
+        """Return a slave's register; None if it does not answer."""
         for _ in range(READS):
             found = self._one(C.FPRD, FIRST_STATION + position, address, bytes(size))
             if found is not None:
@@ -122,12 +122,12 @@ class FrameMaster:
         return None
 
     def write_register(self, position: int, address: int, data: bytes) -> None:
-        """Write a slave's register; NoAnswerError if it does not take it."""
+        """Write a slave's register; NoAnswerError if it does not accept it."""
         self._write(position, address, data)
 
     # --- slaves -----------------------------------------------------------------------------------------------------
     def look(self) -> list[tuple[SlaveStatus, SlaveIdentity]]:
-        """Return state and identity of every slave, without a change to any: addresses are those of the line.
+        """Return state and identity of every slave, addressed by position and left unchanged.
 
         Raises:
             NoAnswerError: If no slave answers.
@@ -136,7 +136,7 @@ class FrameMaster:
         for position in range(self._count()):
             what = f"position {position}"
             status = self._surely(C.APRD, -position, registers.AL_STATUS, bytes(6), what)
-            # A master that was there before may have left the EEPROM to the device, where we cannot read it.
+            # A previous master may have left the EEPROM to the device, where we cannot read it.
             owner = self._surely(C.APRD, -position, registers.SII_ACCESS, bytes(1), what)
             self._surely(C.APWR, -position, registers.SII_ACCESS, bytes(1), what)
             try:
@@ -146,7 +146,7 @@ class FrameMaster:
         return found
 
     def begin(self) -> int:
-        """Find the slaves, give them addresses, take them to Pre-Op; whatever they did before ends."""
+        """Find the slaves, give them addresses, and take them to Pre-Op, from any state. Returns their number."""
         count = self._count()
         self._mapped.clear()
         self._places, self._mailboxes = [], []
@@ -160,7 +160,7 @@ class FrameMaster:
         return count
 
     def recover(self, position: int) -> bool:
-        """Take a slave to Pre-Op; return whether it had restarted, and had no address."""
+        """Take a slave to Pre-Op; return whether it had restarted, and so lost its address."""
         status = self.status(position)
         has_restarted = not status.state
         if has_restarted:
@@ -182,7 +182,7 @@ class FrameMaster:
         return SlaveStatus(0, False, 0) if data is None else _status(data)
 
     def _count(self) -> int:
-        """Return how many slaves there are; NoAnswerError if none."""
+        """Return the number of slaves; NoAnswerError if there are none."""
         for _ in range(TRIES):
             found = self._one(C.BRD, 0, registers.AL_STATUS, bytes(2))
             if found is not None and found.counter:
@@ -194,7 +194,7 @@ class FrameMaster:
         self._surely(C.APWR, -position, registers.STATION_ADDRESS, station, f"position {position}")
 
     def _open_mailbox(self, position: int) -> None:
-        """Take a slave from Init to Pre-Op, its sync managers and FMMUs anew."""
+        """Take a slave from Init to Pre-Op with its sync managers and FMMUs set anew."""
         places = self._places[position]
         off = bytes(registers.SYNC_MANAGER_SIZE)
         for k in range(4):
@@ -206,7 +206,7 @@ class FrameMaster:
         self._to(position, AlState.PRE_OP)
 
     def _to(self, position: int, state: AlState, timeout: float = PATIENCE) -> None:
-        """Take a slave to a state, with its last error acknowledged.
+        """Acknowledge a slave's last error and take it to a state.
 
         Raises:
             BusError: If it refuses, with its AL status code; NoAnswerError if it does not answer.
@@ -224,7 +224,7 @@ class FrameMaster:
 
     # --- EEPROM -----------------------------------------------------------------------------------------------------
     def _words(self, read: int, write: int, station: int, address: int) -> bytes:
-        """Return four bytes of the EEPROM from a word on."""
+        """Return four bytes of the EEPROM, from a word address on."""
         what = f"the EEPROM of the slave at {station & 0xFFFF:04X}h"
         self._surely(write, station, registers.SII_CONTROL, struct.pack("<HI", 0x0100, address), what)
         deadline = time.monotonic() + PATIENCE
@@ -266,7 +266,7 @@ class FrameMaster:
 
     # --- images -----------------------------------------------------------------------------------------------------
     def map(self, sizes: Mapping[int, ImageSizes]) -> None:
-        """Give the images of slaves their places, and take the slaves from Pre-Op to Safe-Op."""
+        """Assign addresses to the images of slaves, and take the slaves from Pre-Op to Safe-Op."""
         self._mapped.clear()
         total = sum(size.outputs + size.inputs for size in sizes.values())
         if total > LONGEST_IMAGE:
@@ -278,19 +278,19 @@ class FrameMaster:
             self._synchronise([k for k in sizes if self.status(k).state == AlState.PRE_OP], self.clock)
         for position, size in sizes.items():
             self._mapped[position] = (address, size)
-            if self.status(position).state == AlState.PRE_OP:  # others have their places
+            if self.status(position).state == AlState.PRE_OP:  # slaves in other states are mapped already
                 self._place(position, address, size)
             address += size.outputs + size.inputs
 
     def _synchronise(self, positions: Sequence[int], clock: Sync0) -> None:
-        """Set the clocks of all slaves, and start SYNC0 of some."""
+        """Set the clocks of all slaves, and start SYNC0 of those at `positions`."""
         check_clocks(self, range(len(self._places)))
         self._surely(C.BWR, 0, registers.RECEIVE_TIMES, bytes(4), "the clocks")
         set_offsets(self, len(self._places))
         start_sync0(self, positions, clock)
 
     def _place(self, position: int, address: int, size: ImageSizes) -> None:
-        """Give the images of one slave their places in its memory and in the logical one; take it to Safe-Op."""
+        """Assign physical and logical addresses to the images of one slave; take it to Safe-Op."""
         places = self._places[position]
         rows = (
             (2, places.outputs, size.outputs, address, 2),
@@ -318,7 +318,7 @@ class FrameMaster:
         self._to(position, AlState.PRE_OP)
 
     def exchange(self, outputs: Sequence[bytes], timeout: float) -> list[bytes | None]:
-        """Send the images of the slaves that are mapped and return theirs, in the order of `map`."""
+        """Send the images of the mapped slaves and return their answers, in the order of `map`."""
         image = b"".join(
             data + bytes(size.inputs) for data, (_, size) in zip(outputs, self._mapped.values(), strict=True)
         )
@@ -349,11 +349,11 @@ class FrameMaster:
         self._mailboxes[position].download(index, sub, data, timeout)
 
     def post(self, position: int, index: int, sub: int, data: bytes) -> None:
-        """Send a short write and wait for no answer."""
+        """Send a short write without waiting for its answer."""
         self._mailboxes[position].post(index, sub, data)
 
     def take_emergencies(self) -> list[ReceivedEmergency]:
-        """Return and forget the emergencies that came."""
+        """Return and forget the received emergencies."""
         found = []
         for position, mailbox in enumerate(self._mailboxes):
             mailbox.look(0.0)
@@ -362,7 +362,7 @@ class FrameMaster:
         return found
 
     def close(self) -> None:
-        """Take all slaves to Init, as far as they answer, and let go of the way."""
+        """Take all slaves to Init, as far as they answer, and close the carrier."""
         for position in range(len(self._places)):
             self._one(
                 C.FPWR, FIRST_STATION + position, registers.AL_CONTROL, struct.pack("<H", AlState.INIT | ACKNOWLEDGE)

@@ -1,4 +1,4 @@
-"""How a master's frames come to a segment, each as the payload of Ethernet or UDP: UDP, a raw socket, a call."""
+"""Carriers of a master's frames to a segment, each frame as the payload of Ethernet or UDP: UDP, raw socket, call."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from drive_env.fieldbus.errors import OpenError
 
 
 class FrameWay(Protocol):
-    """A way: header and datagrams out, and as they come back."""
+    """A carrier: sends header and datagrams, and receives them when they return."""
 
     name: str
 
     def send(self, payload: bytes) -> None:
-        """Send a frame; one that does not get out is one that does not come back."""
+        """Send a frame; if it cannot be sent, it counts as lost."""
 
     def receive(self, timeout: float) -> bytes | None:
-        """Return a frame that comes within `timeout` [s], or None."""
+        """Return a frame that arrives within `timeout` [s], or None."""
 
     def close(self) -> None:
-        """End it."""
+        """Close it."""
 
 
 class CallWay:
     """A segment of the same process.
 
     Args:
-        transfer: Returns an Ethernet frame as it comes back, None if it does not: `EtherCatWorld.receive`.
+        transfer: Returns an Ethernet frame as it returns from the segment, None if it is lost: `EtherCatWorld.receive`.
     """
 
     name = "this process"
@@ -45,14 +45,14 @@ class CallWay:
         self._came: list[bytes] = []
 
     def send(self, payload: bytes) -> None:
-        """Have a frame pass the slaves."""
+        """Pass a frame through the slaves."""
         head = datagrams.BROADCAST + datagrams.MASTER + datagrams.ETHERTYPE
         done = self._transfer((head + payload).ljust(datagrams.SHORTEST_FRAME, b"\0"))
         if done is not None:
             self._came.append(done[datagrams.ETHERNET :])
 
     def receive(self, timeout: float) -> bytes | None:
-        """Return a frame that has passed them."""
+        """Return a frame that has passed the slaves."""
         return self._came.pop(0) if self._came else None
 
     def close(self) -> None:
@@ -64,7 +64,7 @@ class UdpWay:
     """EtherCAT over UDP on this computer.
 
     Args:
-        port: Of the slaves: `drive-env serve --interface ethercat-udp`.
+        port: The slaves' port: `drive-env serve --interface ethercat-udp`.
     """
 
     def __init__(self, port: int = datagrams.PORT) -> None:
@@ -75,23 +75,23 @@ class UdpWay:
 
     def send(self, payload: bytes) -> None:
         """Send a datagram."""
-        with contextlib.suppress(OSError):  # no server at the address now: no answer says so
+        with contextlib.suppress(OSError):  # without a server at the address the frame counts as lost
             self._socket.send(payload)
 
     def receive(self, timeout: float) -> bytes | None:
-        """Return a datagram that comes within `timeout` [s], or None."""
+        """Return a datagram that arrives within `timeout` [s], or None."""
         return _receive(self._socket, timeout)
 
     def close(self) -> None:
-        """End it."""
+        """Close it."""
         self._socket.close()
 
 
 class RawWay:
-    """EtherCAT on a network interface of Linux, for a look at a segment.
+    """EtherCAT on a network interface of Linux, to inspect a segment.
 
     Args:
-        interface: Its name, as veth0.
+        interface: Its name, e.g. veth0.
 
     Raises:
         OpenError: If there is no such interface, or raw sockets are missing or not allowed.
@@ -123,12 +123,12 @@ class RawWay:
             self._socket.send((head + payload).ljust(datagrams.SHORTEST_FRAME, b"\0"))
 
     def receive(self, timeout: float) -> bytes | None:
-        """Return a frame that comes within `timeout` [s], or None."""
+        """Return a frame that arrives within `timeout` [s], or None."""
         frame = _receive(self._socket, timeout)
         return None if frame is None else frame[datagrams.ETHERNET :]
 
     def close(self) -> None:
-        """End it."""
+        """Close it."""
         self._socket.close()
 
 

@@ -1,11 +1,12 @@
-"""Process data over EtherCAT: one image of each direction and slave, all of them in every frame.
+"""Process data over EtherCAT: one image per direction and slave, all of them in every frame.
 
-An image stays as it is from frame to frame: what is not played keeps its last value, and what is written to an object
-of an image by an SDO is put into the image, too. Images are changed in Pre-Op, where no motor runs; so they are not
-changed while an axis is enabled.
+An image persists from frame to frame: an object that is not played keeps its last value, and an SDO write to an object
+of an image changes the image, too. The mapping can be changed only in Pre-Op, where no motor runs, so never while an
+axis is enabled.
 
-In lockstep no time passes but with a frame of process data. What no image has, or would change it while an axis is
-enabled, is then read by SDO before each frame, when the drive has what the frame brings back.
+In lockstep time passes only with a frame of process data. Objects that no image can carry, or that would change the
+mapping while an axis is enabled, are then read by SDO before each frame, since their values are those of the frame's
+inputs.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from drive_env.master.ethercat.slave_images import SlaveImages
 from drive_env.master.packing import Member, unpack_rows
 from mechanics.arrays import Integers
 
-FRAME = 0.02  # s for a frame to come back in real time
+FRAME = 0.02  # s for a frame to return in real time
 LONGEST_STATE = 5.0  # s
 
 
@@ -44,7 +45,7 @@ class ImageSamples:
         self._data = data
         self._layout = layout
         self._description = description
-        self.rows: list[list[bytes]] = []  # of each cycle, the image of each slave
+        self.rows: list[list[bytes]] = []  # per cycle, the image of each slave
         data.takers.append(self.rows)
 
     def complete(self) -> int:
@@ -62,14 +63,14 @@ class ImageSamples:
         return values
 
     def missing(self, rows: int, timeout: float) -> NoAnswerError:
-        """Return the error for samples that stay out, of so many cycles and after so long a wait [s]."""
+        """Return the error for samples of `rows` cycles that did not come within `timeout` [s]."""
         return NoAnswerError(
             f"{len(self.rows)} input images came in {rows} cycles, and no more within {timeout:g} s; check cable and "
             "power, and whether every drive is in Op"
         )
 
     def close(self) -> None:
-        """Take nothing more."""
+        """Stop collecting."""
         self._data.takers = [taker for taker in self._data.takers if taker is not self.rows]
 
 
@@ -88,7 +89,7 @@ class ImageRows:
                     parts.append((member.start, member.start + member.size, raw))
 
     def send(self, row: int) -> None:
-        """Put a row into the images, which go out with the next cycle."""
+        """Put a row into the images, which are sent with the next cycle."""
         with self._data.turn:
             for image, parts in zip(self._data.images, self._parts, strict=True):
                 for start, end, raw in parts:
@@ -99,20 +100,20 @@ class EtherCatProcessData:
     """The present mapping, and the exchange of images.
 
     Args:
-        master: Of the segment.
+        master: The segment's master.
         nodes: Positions of the slaves.
-        description: What device they are.
-        lockstep: Time passes by frames alone.
+        description: Their device.
+        lockstep: Time passes only with frames.
 
     Attributes:
-        mapping: Its number: it grows with every change.
+        mapping: Number of the mapping, which grows with every change.
         turn: Held while images are written or exchanged.
-        images: What goes into each slave.
-        takers: Who collects what comes back: rows of the images of all slaves.
-        exchanged_at: When images last came back [s].
-        owed: Rows of a run of cycles that are not back.
-        is_silent: Nothing may go out any more, so that the drives stop by themselves.
-        phase: Learns the reference's time with each exchange; None without distributed clocks.
+        images: Output image of each slave.
+        takers: The collectors of input images: rows of the images of all slaves.
+        exchanged_at: When images last returned [s].
+        owed: Rows of a run of cycles that have not returned.
+        is_silent: Nothing may be sent any more, so that the drives stop by themselves.
+        phase: Notes the reference's time with each exchange; None without distributed clocks.
     """
 
     def __init__(self, master: EtherCatMaster, nodes: Sequence[int], description: Description, lockstep: bool) -> None:
@@ -132,14 +133,14 @@ class EtherCatProcessData:
         self._planner = ImagePlanner(description)
         self._layouts: dict[int, ImageLayout] = {}
         self._places: dict[Key, tuple[int, int]] = {}
-        self._beside: tuple[Entry, ...] = ()  # what is read by SDO before each frame, in lockstep
-        self._ready: set[int] = set()  # slaves that have these images, by their number here
-        self._modes: dict[tuple[int, Key], bytes] = {}  # as written last, of drives whose 6060h cannot be read
+        self._beside: tuple[Entry, ...] = ()  # objects read by SDO before each frame, in lockstep
+        self._ready: set[int] = set()  # slaves with the present mapping, by their number here
+        self._modes: dict[tuple[int, Key], bytes] = {}  # last written modes, for drives whose 6060h cannot be read
         self._clients: list[ObjectClient] = []
         self._slaves: list[SlaveImages] = []
 
     def connect(self, clients: Sequence[ObjectClient]) -> None:
-        """Take the slaves' objects."""
+        """Store the clients of the slaves' objects."""
         self._clients = list(clients)
         self._slaves = [SlaveImages(client, self._description) for client in clients]
 
@@ -159,25 +160,25 @@ class EtherCatProcessData:
         """Return the wanted entries, and those of `welcome` that are in the same image.
 
         Raises:
-            ObjectAccessError: 06040042h if not even what is wanted fits.
+            ObjectAccessError: 06040042h if not even the wanted ones fit.
         """
         fitting = self._fitting(wanted) if self._lockstep else wanted
         image = self._planner.plan(INPUTS, fitting, self._layout(INPUTS)).entries
         return (*wanted, *(entry for entry in welcome if entry in image and entry not in wanted))
 
     def is_mapped(self, played: tuple[Entry, ...], sampled: tuple[Entry, ...]) -> bool:
-        """Return whether the images that are exchanged carry these already."""
+        """Return whether the exchanged images already carry these entries."""
         if self.missing or not self._carries(OUTPUTS, played):
             return False
-        # An object that is not recorded any more is not read before each frame.
+        # an object that is no longer recorded is no longer read before each frame
         return set(sampled) - set(self._layouts[INPUTS].entries) == set(self._beside)
 
     def map(self, played: tuple[Entry, ...], sampled: tuple[Entry, ...]) -> None:
-        """Have images carry entries of every axis besides their present ones, as far as there is room.
+        """Have images carry entries of every axis in addition to their present ones, as far as there is room.
 
         Raises:
-            ObjectAccessError: 06040042h if they do not fit; 08000022h while an axis is enabled: images are changed in
-                Pre-Op, where no motor runs.
+            ObjectAccessError: 06040042h if they do not fit; 08000022h while an axis is enabled: the mapping can be
+                changed only in Pre-Op, where no motor runs.
         """
         fitting = self._fitting(sampled) if self._lockstep else sampled
         if self._lockstep and self._is_any_enabled() and self._carries(OUTPUTS, played):
@@ -198,7 +199,7 @@ class EtherCatProcessData:
         self.operate()
 
     def sampled_entries(self) -> tuple[Entry, ...]:
-        """Return the objects that come with every cycle; none before the images are ready."""
+        """Return the objects that come with every cycle; empty before the images are ready."""
         return (*self._layouts[INPUTS].entries, *self._beside) if self._ready else ()
 
     def outputs(self, played: Mapping[Entry, Integers]) -> ImageRows | None:
@@ -220,7 +221,7 @@ class EtherCatProcessData:
             self._slaves[k].forget()
 
     def restore(self, node: int) -> None:
-        """Take a node out of Op and put its mapping back as it was found; BusError if not all of it could be."""
+        """Take a node out of Op and restore its mapping; BusError if not all of it could be restored."""
         with self.turn:
             self._ready.discard(node)
         self._master.leave_op(self._nodes[node])
@@ -229,11 +230,11 @@ class EtherCatProcessData:
     # --- what the link asks -----------------------------------------------------------------------------------------
     @property
     def missing(self) -> list[int]:
-        """Slaves that do not have these images, by their number."""
+        """Slaves without the present mapping, by their number."""
         return [k for k in range(len(self._nodes)) if k not in self._ready]
 
     def prepare(self) -> None:
-        """Give the slaves that are in Pre-Op their images, filled with their objects' values, and go to Safe-Op."""
+        """Set the images of the slaves in Pre-Op, filled with their objects' values, and take them to Safe-Op."""
         layouts = {direction: self._layout(direction) for direction in (OUTPUTS, INPUTS)}
         for k in self.missing:
             self._slaves[k].set_cycle(self._description.cycle)
@@ -260,7 +261,7 @@ class EtherCatProcessData:
                 self._master.leave_op(position)
 
     def put(self, node: int, key: Key, data: bytes) -> bytes | None:
-        """Put an object's value into the output image; return the bytes before, None if the image lacks the object."""
+        """Put an object's value into the output image; return its previous bytes, None if it is not there."""
         if cia402.of_first_axis(key[0]) == cia402.MODE:
             self._modes[node, key] = data
         if node not in self._ready or key not in self._places:
@@ -276,10 +277,10 @@ class EtherCatProcessData:
         return bool(self._ready) and key in self._places
 
     def exchange(self, is_cycle: bool, timeout: float = FRAME) -> bool:
-        """Exchange images with all slaves; only those of a cycle are samples.
+        """Exchange images with all slaves; they count as samples only if it is a cycle.
 
         Returns:
-            Whether the images of all of them came back.
+            Whether the images of all of them returned.
         """
         with self.turn:
             if self.is_silent or self.missing:
@@ -298,9 +299,9 @@ class EtherCatProcessData:
             return True
 
     def settle(self, timeout: float) -> bool:
-        """Exchange images for the cycles whose rows are not back; return whether all are.
+        """Exchange images for the cycles whose rows have not returned; return whether all have.
 
-        The row of a frame that was lost is taken by the next one, so that rows are as many as cycles.
+        The row of a lost frame is taken from the next one, so that there are as many rows as cycles.
         """
         with self.turn:
             while self.owed:
@@ -311,7 +312,7 @@ class EtherCatProcessData:
 
     # --- inside -----------------------------------------------------------------------------------------------------
     def _fitting(self, wanted: Sequence[Entry]) -> tuple[Entry, ...]:
-        """Return those of the wanted entries that fit into one image, the first ones first."""
+        """Return the wanted entries that fit into one image, the first ones first."""
         fitting: tuple[Entry, ...] = ()
         for entry in wanted:
             with suppress(ObjectAccessError):
@@ -321,7 +322,7 @@ class EtherCatProcessData:
         return fitting
 
     def _sampled_layout(self) -> ImageLayout:
-        """Return where each object is in a row: the input image, and behind it the objects read by SDO."""
+        """Return the place of each object in a row: the input image, then the objects read by SDO."""
         layout, members = self._layouts[INPUTS], []
         size = layout.size
         for entry in self._beside:
@@ -332,7 +333,7 @@ class EtherCatProcessData:
         return layout._replace(members=(*layout.members, *members), size=size)
 
     def _read_beside(self) -> list[bytes]:
-        """Read the objects beside the image of each slave by SDO, in the order of `_sampled_layout`."""
+        """Read the objects outside each slave's image by SDO, in the order of `_sampled_layout`."""
         known, rows = self._description, []
         for client in self._clients:
             parts = []
@@ -344,7 +345,7 @@ class EtherCatProcessData:
         return rows
 
     def _layout(self, direction: int) -> ImageLayout:
-        """Return the image that is mapped, or will be unless more is asked for: the slave's own, completed."""
+        """Return the image that is mapped, or will be unless more is requested: the slave's own, completed."""
         if direction not in self._layouts:
             found = self._slaves[0].found(direction, self._planner)
             self._layouts[direction] = self._planner.completed(direction, found)
@@ -373,7 +374,7 @@ class EtherCatProcessData:
         return self._enabled_axis() is not None
 
     def _enabled_axis(self) -> int | None:
-        """Return the first axis that is enabled; None: none is, or no slave has its images."""
+        """Return the first axis that is enabled; None if there is none, or no slave has its images."""
         if not self._ready:
             return None
         status = self._description.dictionary.find((cia402.STATUSWORD, 0))
@@ -389,7 +390,7 @@ class EtherCatProcessData:
         return any(entry in layout.entries for layout in self._layouts.values())
 
     def _as_it_is(self, node: int, layout: ImageLayout) -> bytearray:
-        """Return an output image of the slave's present values; of those that cannot be read the last mode, else 0."""
+        """Return an output image with the slave's present values; for unreadable ones the last mode, otherwise 0."""
         image = bytearray(layout.size)
         for member in layout.members:
             key, timeout = self._description.key(member.entry, member.axis), self._description.answer_timeout

@@ -1,4 +1,4 @@
-"""Which objects lie where in the images of a slave, and which images a device can have (ETG.1000.6, 5.6.7.4)."""
+"""Places of objects in the images of a slave, and the images that a device can have (ETG.1000.6, 5.6.7.4)."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from drive_env.fieldbus.description import Description
 from drive_env.master.packing import Member
 from drive_env.node.mapping import is_gap
 
-OUTPUTS, INPUTS = 0x1C12, 0x1C13  # what sync managers 2 and 3 carry
+OUTPUTS, INPUTS = 0x1C12, 0x1C13  # the objects that sync managers 2 and 3 carry
 MAPPINGS = {OUTPUTS: range(0x1600, 0x1800), INPUTS: range(0x1A00, 0x1C00)}
-FIRST_PDO = {OUTPUTS: 0x1600, INPUTS: 0x1A00}  # of a device that names none
-# What a drive is commanded and watched by, wherever there is room for it.
+FIRST_PDO = {OUTPUTS: 0x1600, INPUTS: 0x1A00}  # of a device whose data name none
+# Objects that command a drive and show its state, mapped if there is room.
 ESSENTIAL = {
     OUTPUTS: (cia402.CONTROLWORD,),
     INPUTS: (cia402.STATUSWORD, cia402.POSITION_ACTUAL, cia402.VELOCITY_ACTUAL),
 }
-USUAL_ENTRIES = 8  # that a mapping object takes where the EDS does not list them
+USUAL_ENTRIES = 8  # that a mapping object holds if the EDS does not list them
 
 
 class ImageLayout(NamedTuple):
     """One image.
 
     Attributes:
-        pdo: Object that the sync manager is assigned.
-        members: Objects of the axes and their places; one of the whole node stands for each axis.
+        pdo: Mapping object assigned to the sync manager.
+        members: Objects of the axes and their places; an object of the whole node is listed for each axis.
         size: Length [bytes].
         mapped: Mapping entries to be written; None for a ready-made image.
-        more: Further objects that it is assigned, of a ready-made image in several parts.
+        more: Further assigned mapping objects of a ready-made image in several parts.
     """
 
     pdo: int
@@ -44,7 +44,7 @@ class ImageLayout(NamedTuple):
 
     @property
     def entries(self) -> tuple[Entry, ...]:
-        """Return the entries that every axis has in it."""
+        """Return the entries that every axis has in the image."""
         axes = {member.axis for member in self.members}
         of_axes: dict[Entry, set[int]] = {}
         for member in self.members:
@@ -60,13 +60,13 @@ class ImagePlanner:
     """Finds images of a device that carry wanted entries.
 
     Args:
-        description: The device. Images that it has ready-made are those of its data.
+        description: The device. Its ready-made images are those of its data.
     """
 
     def __init__(self, description: Description) -> None:
         self._description = description
         known = description.dictionary
-        # Of a further axis' object, which the EDS may list, too, that of the first axis counts.
+        # If the EDS lists a further axis' object, too, the first axis' entry counts.
         self._by_key = {(entry.index, entry.sub): (entry, 0) for entry in known} | {
             key: (entry, axis) for key, (entry, axis) in description.of_further_axes().items()
         }
@@ -84,9 +84,9 @@ class ImagePlanner:
                     self._ready_made[direction].append(self._of_raws([entry.index], raws))
 
     def parsed(self, direction: int, pdos: Sequence[int], mapped: Sequence[int]) -> ImageLayout | None:
-        """Return the image that mapping objects of a slave make; None where it is not the same for every axis.
+        """Return the image of a slave's mapping objects; None if it is not the same for every axis.
 
-        One that cannot be written is ready-made, and taken as it is; so are several if one of them is.
+        An image with a read-only mapping object is ready-made, and stays unchanged; so do several if one of them is.
         """
         for layout in self._ready_made[direction]:
             if [layout.pdo] == list(pdos):
@@ -111,7 +111,7 @@ class ImagePlanner:
         """Return an image with the wanted entries of every axis; the current one if it has them.
 
         Raises:
-            ObjectAccessError: 06040042h if it is too much for one image.
+            ObjectAccessError: 06040042h if they do not fit into one image.
         """
         if set(wanted) <= set(current.entries):
             return current
@@ -128,11 +128,11 @@ class ImagePlanner:
         return self._filled(direction, layout, current.entries)
 
     def completed(self, direction: int, current: ImageLayout) -> ImageLayout:
-        """Return an image with the entries that command and show a drive besides, as far as there is room."""
+        """Return an image with the usual command and state entries added, as far as there is room."""
         return current if current.mapped is None else self._filled(direction, current, ())
 
     def free(self, pdo: int, entries: Iterable[Entry]) -> ImageLayout:
-        """Return the image that carries entries of every axis, axis by axis."""
+        """Return the freely mapped image that carries entries of every axis, axis by axis."""
         known = self._description
         places: dict[Key, int] = {}
         members, mapped, start = [], [], 0
@@ -165,7 +165,7 @@ class ImagePlanner:
         raise ObjectAccessError(CANNOT_BE_MAPPED, f"{missing.label} is in no image of this drive, for every axis")
 
     def _of_fields(self, pdo: int, fields: Iterable[tuple[Key | None, int]]) -> ImageLayout:
-        """Return the ready-made image of fields: each an object, None for a reserved one, and its bits."""
+        """Return the ready-made image of fields: each an object (None if reserved) and its bits."""
         known = self._description
         members, bit = [], 0
         for key, bits in fields:
@@ -179,7 +179,7 @@ class ImagePlanner:
         return ImageLayout(pdo, tuple(members), (bit + 7) // 8, None)
 
     def _is_ready_made(self, pdo: int) -> bool:
-        """Return whether a mapping object cannot be written."""
+        """Return whether a mapping object is read-only."""
         known = self._description.dictionary
         return known.has((pdo, 1)) and known.find((pdo, 1)).access in ("ro", "const")
 
@@ -189,7 +189,7 @@ class ImagePlanner:
         return self._of_fields(pdos[0], keys)._replace(more=tuple(pdos[1:]))
 
     def _room(self, pdo: int) -> int:
-        """Return how many entries a mapping object takes."""
+        """Return the number of entries that a mapping object can hold."""
         known = self._description.dictionary
         return sum(known.has((pdo, sub)) for sub in range(1, 255)) or USUAL_ENTRIES
 

@@ -1,4 +1,4 @@
-"""The master's end of a slave's mailbox: CoE transfers, and the emergencies that come between (ETG.1000.6, 5.6)."""
+"""The master's end of a slave's mailbox: CoE transfers, and emergencies that come between (ETG.1000.6, 5.6)."""
 
 from __future__ import annotations
 
@@ -43,10 +43,11 @@ class MailboxClient:
     """The mailbox of one slave; one transfer at a time.
 
     Args:
-        send: Writes a message of the mailbox's whole length; whether there was room, None: no frame came back.
-        fetch: Returns what the slave has sent, b"" where there is nothing, None: no frame came back.
-        repeat: Has the slave give its last message again: it was lost on its way.
-        lengths: Of the mailbox that the master writes, and of the one that it reads [bytes].
+        send: Writes a message of the mailbox's whole length; returns whether there was room, None if the frame was
+            lost.
+        fetch: Returns the slave's next message, b"" if there is no message, None if the frame was lost.
+        repeat: Makes the slave send its last message again after a loss.
+        lengths: Lengths of the mailboxes that the master writes and reads [bytes].
         alive: Called again and again while an answer is waited for.
     """
 
@@ -110,7 +111,7 @@ class MailboxClient:
                 toggle ^= TOGGLE
 
     def post(self, index: int, sub: int, data: bytes) -> None:
-        """Send a short write and wait for no answer, unless a transfer is under way."""
+        """Send a short write without waiting for its answer, unless a transfer is under way."""
         if not self._turn.acquire(blocking=False):
             return
         try:
@@ -120,12 +121,12 @@ class MailboxClient:
             self._turn.release()
 
     def look(self, timeout: float) -> None:
-        """Take waiting messages that are no answers, unless another thread has the turn for `timeout` [s]."""
+        """Handle waiting messages that are not answers, unless another thread has the turn for `timeout` [s]."""
         if not self._turn.acquire(timeout=max(timeout, 0.0)):
             return
         try:
             while True:
-                with contextlib.suppress(SlaveMailboxError):  # of a request that is not waited for any more
+                with contextlib.suppress(SlaveMailboxError):  # the answer to a request that is no longer awaited
                     if self._take() is None:
                         return
         finally:
@@ -137,8 +138,8 @@ class MailboxClient:
         whole = self._request(request)
         is_sent = False
         while True:
-            # Sent again, since its frame did not come back, it has the same counter and is done once. The slave may
-            # have had it all the same, and one whose answers are not read takes no more requests.
+            # Sent again after a lost frame, it has the same counter and is executed once. The slave may have received
+            # it the first time, and accepts no more requests until its answers are read.
             is_sent = is_sent or bool(self._send_message(whole))
             answer = self._take()
             if answer is None:
@@ -150,7 +151,7 @@ class MailboxClient:
                 return answer
 
     def _request(self, request: bytes) -> bytes:
-        """Return a message of the mailbox's whole length; each has the next counter."""
+        """Return a message with the mailbox's full length and the next counter."""
         self._counter = self._counter % COUNTER + 1
         content = message(CoeService.SDO_REQUEST, request)
         head = struct.pack("<HHBB", len(content), 0, 0, MailboxProtocol.COE | self._counter << COUNTER_SHIFT)
@@ -163,7 +164,7 @@ class MailboxClient:
         time.sleep(LOOK)
 
     def _take(self) -> bytes | None:
-        """Take a message: return the SDO that it is, b"" for another kind, None if there is no message."""
+        """Read a message; return it if it is an SDO, b"" for another kind, None if there is no message."""
         data = self._fetch()
         if data is None:
             self._repeat()
@@ -173,7 +174,7 @@ class MailboxClient:
         length, _, _, kind = struct.unpack_from("<HHBB", data)
         content = data[MAILBOX_HEADER : MAILBOX_HEADER + length]
         counter = kind >> COUNTER_SHIFT & COUNTER
-        if counter and counter == self._came:  # the last one again
+        if counter and counter == self._came:  # a repetition of the last one
             return b""
         self._came = counter
         if kind & PROTOCOL == MailboxProtocol.ERROR:

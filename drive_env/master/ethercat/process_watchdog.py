@@ -1,4 +1,4 @@
-"""How slaves notice that their master is dead: the watchdog of sync manager 2, which process data keep quiet."""
+"""The slaves' watch over their master: the watchdog of sync manager 2, which process data feed."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from drive_env.master.ethercat.image_data import EtherCatProcessData
 
 TICK = 40e-9  # s
 LONGEST = 0xFFFF  # ticks of the divider
-TRIGGERS = 0x40  # of a sync manager's control: process data keep the watchdog quiet
+TRIGGERS = 0x40  # of a sync manager's control: process data trigger the watchdog
 OUTPUTS_CONTROL = registers.SYNC_MANAGERS + 2 * registers.SYNC_MANAGER_SIZE + 4
 FACTORY = 0.1  # s, of a controller after reset
 TIMES = (registers.WATCHDOG_DIVIDER, registers.SM_WATCHDOG)
-LOOK = 0.05  # s between two looks whether another master has changed them
+LOOK = 0.05  # s between two checks whether another master has changed them
 
 
 class ProcessWatchdog:
     """The watch over this master by each slave's watchdog.
 
-    A slave that gets no outputs for so long leaves Op, and its axes stop by their fault reaction. It watches in Op
-    alone, where alone motors run. After power-on it is set to 100 ms.
+    A slave that gets no outputs for the watchdog's time leaves Op, and its axes stop by their fault reaction. It
+    watches only in Op, the only state in which motors run. After power-on the time is 100 ms.
 
     Args:
-        master: Of the segment.
+        master: The segment's master.
         nodes: Positions of the slaves.
         clients: Their objects.
         data: Their process data.
-        description: What device they are.
+        description: Their device.
     """
 
     def __init__(
@@ -49,20 +49,20 @@ class ProcessWatchdog:
         self._master, self._nodes, self._data = master, tuple(nodes), data
         self._objects = [ChangedObjects(*one, description) for one in zip(nodes, clients, strict=True)]
         self._before: dict[int, bytes] = {}
-        self._set: dict[int, tuple[bytes, bytes]] = {}  # divider and time that each has been given
+        self._set: dict[int, tuple[bytes, bytes]] = {}  # divider and time written to each
         self._time = math.inf
         self._looked_at = 0.0
 
     @property
     def detection_time(self) -> float:
-        """The silence after which every node has noticed [s]; infinite while they do not watch."""
+        """The silence after which every node has noticed [s]; infinite while no watchdog is set."""
         return self._time
 
     def begin(self, silence: float) -> None:
         """Have every node act when its master falls silent for `silence` [s], or less.
 
         Raises:
-            NoWatchdogError: If a slave has no watchdog on its outputs, or does not take the time.
+            NoWatchdogError: If a slave has no watchdog on its outputs, or does not accept the time.
             BusError: If a node does not answer.
         """
         times = []
@@ -90,25 +90,25 @@ class ProcessWatchdog:
         self.keep()
 
     def keep(self) -> None:
-        """Exchange images, where none were for a third of the watchdog's time."""
+        """Exchange images if none were exchanged for a third of the watchdog's time."""
         if time.monotonic() - self._data.exchanged_at > min(self._time, FACTORY) / 3.0:
             self._data.exchange(is_cycle=False)
 
     def cease(self) -> None:
-        """Exchange images a last time, and never again, so that the drives stop by themselves."""
+        """Exchange images a last time, so that the drives then stop by themselves."""
         self._data.exchange(is_cycle=False)
         self._data.is_silent = True
 
     def end(self) -> None:
-        """Note that the watchdogs are given up; images may go on."""
+        """Note that the watchdogs are given up; images may still be exchanged."""
         self._time = math.inf
 
     def is_set(self, node: int) -> bool:
-        """Return whether a node's watchdog was set and not put back."""
+        """Return whether a node's watchdog was set and not yet restored."""
         return node in self._set
 
     def is_in_force(self, node: int) -> bool:
-        """Return whether a node, asked, has the time that was set and is in Op, where it watches."""
+        """Return whether a node, asked, has the time that was set and is in Op, the state in which it watches."""
         position = self._nodes[node]
         has = tuple(self._register(position, address) for address in TIMES) == self._set.get(node)
         return has and self._master.status(position).is_op and self._objects[node].are_in_force()
@@ -118,7 +118,7 @@ class ProcessWatchdog:
         return any(k in self._set and one.holds(key) for k, one in enumerate(self._objects))
 
     def restore(self, node: int) -> None:
-        """Put a node's watchdog back as it was found; BusError if it did not take all of it."""
+        """Restore a node's watchdog; BusError if it did not accept all of it."""
         self._set.pop(node, None)
         before = self._before.pop(node, None)
         try:
@@ -128,15 +128,16 @@ class ProcessWatchdog:
                 self._master.write_register(self._nodes[node], registers.SM_WATCHDOG, before)
 
     def forget(self, node: int) -> None:
-        """Forget the watchdog found: the node was reset."""
+        """Forget the watchdog's previous settings: the node was reset."""
         self._objects[node].forget()
         self._before.pop(node, None)
         self._set.pop(node, None)
 
     def take_rival(self) -> str:
-        """Return, once, which slave's watchdog another master has changed; it is set again. "" if none was.
+        """Return, once, the slave whose watchdog another master has changed, and restore its time; else "".
 
-        A master that takes a slave's address, states or images is noticed otherwise: the images do not come back.
+        Another master that takes over a slave's address, states or images is noticed otherwise: the images do not
+        return.
         """
         now = time.monotonic()
         if now - self._looked_at < LOOK:
@@ -152,7 +153,7 @@ class ProcessWatchdog:
         )
 
     def _set_again(self, node: int) -> bool:
-        """Return whether a slave that answers has lost its watchdog's time, which it gets back."""
+        """Return whether a slave that answers had lost its watchdog's time, which is set again."""
         position, wanted = self._nodes[node], self._set[node]
         found = tuple(self._master.register(position, address, 2) for address in TIMES)
         if None in found or found == wanted:

@@ -1,4 +1,4 @@
-"""The mapping of a slave: read as found, changed in Pre-Op from the outside in, put back."""
+"""The mapping of a slave: read as found, changed in Pre-Op in the prescribed order, restored."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class SlaveImages:
 
     Args:
         sdo: Its objects.
-        description: What device it is.
+        description: Its device.
     """
 
     def __init__(self, sdo: ObjectClient, description: Description) -> None:
@@ -32,14 +32,14 @@ class SlaveImages:
         self._before: dict[int, tuple[list[int], dict[int, list[int]]]] = {}
 
     def found(self, direction: int, planner: ImagePlanner) -> ImageLayout:
-        """Return the image that the slave has now; an empty one if it has entries without a name."""
+        """Return the slave's present image; an empty one if it has entries without a name."""
         assigned = self._read_list(direction, 2)
         mapped = [raw for pdo in assigned for raw in self._read_list(pdo, 4)]
         layout = planner.parsed(direction, assigned, mapped) if assigned else None
         return planner.free(assigned[0] if assigned else FIRST_PDO[direction], ()) if layout is None else layout
 
     def change(self, direction: int, layout: ImageLayout) -> None:
-        """Give the slave an image: no assignment, no entries, entries, their number, the assignment."""
+        """Write an image to the slave: no assignment, no entries, entries, their number, the assignment."""
         assigned = self._read_list(direction, 2)
         mapped = None if layout.mapped is None else self._read_list(layout.pdo, 4)
         wanted = [layout.pdo, *layout.more]
@@ -53,7 +53,7 @@ class SlaveImages:
         self._write_list(direction, wanted, 2)
 
     def set_cycle(self, cycle: float) -> None:
-        """Tell the slave the cycle of process data [s], if it has a register for it, and knows this one."""
+        """Write the cycle of process data [s] to the slave, if it has an object for it that accepts this cycle."""
         wanted = round(1e6 * cycle)
         if self._cycle_key is None or wanted not in self._cycles:
             return
@@ -63,7 +63,7 @@ class SlaveImages:
             self._cycle_before = before
 
     def restore(self) -> None:
-        """Put assignments, mappings and cycle back as they were found; BusError if not all of it could be."""
+        """Restore assignments, mappings and cycle; BusError if not all of it could be restored."""
         before, self._before = self._before, {}
         tidying = Tidying()
         if self._cycle_key is not None and self._cycle_before is not None:
@@ -86,7 +86,7 @@ class SlaveImages:
         return int.from_bytes(self._sdo.read(index, sub, f"{index:04X}h:{sub:02X}", self._timeout), "little")
 
     def _read_list(self, index: int, size: int) -> list[int]:
-        """Return the entries of an object; none of one that is not there."""
+        """Return the entries of an object; empty if the slave lacks it."""
         try:
             count = self._read(index, 0)
         except ObjectAccessError:

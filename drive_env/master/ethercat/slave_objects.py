@@ -1,4 +1,4 @@
-"""The objects of a slave, by its mailbox; values that the output image carries are put there, too."""
+"""The objects of a slave, by its mailbox; values of objects in the output image are put there, too."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ class SlaveObjects:
     Args:
         master: Of the segment.
         node: The slave's number among the nodes.
-        position: And in the line.
+        position: Its position in the line.
         data: Its process data.
-        controlwords: Index and sub-index of those of its axes.
-        operate: Takes the slaves to Op, where alone motors run.
-        wake: Takes it to where it answers.
-        lockstep: Time passes by frames alone.
+        controlwords: Index and sub-index of its axes' controlwords.
+        operate: Takes the slaves to Op, the only state in which motors run.
+        wake: Takes it to a state in which it answers.
+        lockstep: Time passes only with frames.
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class SlaveObjects:
     def write(self, index: int, sub: int, data: bytes, label: str, timeout: float) -> None:
         """Write the bytes of an object, once.
 
-        The output image has it first: a frame that comes between must not bring the old value back.
+        The output image is changed first: a frame sent in between must not bring the old value back.
         """
         if (index, sub) in self._controlwords and cia402.may_enable(int.from_bytes(data, "little")):
             self._operate()
@@ -72,7 +72,7 @@ class SlaveObjects:
             raise
 
     def put_back(self, index: int, sub: int, data: bytes, label: str, timeout: float) -> None:
-        """Write an object's value of before; a slave that is silent is woken."""
+        """Write an object's previous value; a silent slave is woken."""
         try:
             self.write(index, sub, data, label, timeout)
         except NoAnswerError:
@@ -86,7 +86,7 @@ class SlaveObjects:
         return None
 
     def command(self, index: int, sub: int, data: bytes) -> None:
-        """Send a short write without waiting: in the output image, which goes out now, or by the mailbox."""
+        """Send a short write without waiting: in the output image, exchanged at once, or by the mailbox."""
         if self._data.put(self._node, (index, sub), data) is None or self._lockstep:
             self._master.post(self._position, index, sub, data)
         else:

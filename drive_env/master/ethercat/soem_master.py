@@ -1,8 +1,8 @@
 """A master on a network interface: SOEM, by pysoem (extra `ethercat`), finds slaves, maps and exchanges images.
 
-Objects are transferred by a mailbox of ours over SOEM's datagrams. SOEM's own transfers in one thread would hold up the
-images that go in another: its threads take each other's frames from the socket, and who waits there for one that it
-already has waits for the socket's shortest time, 1 us, of which Linux makes one or two of its ticks, 4 to 20 ms.
+Objects are transferred by our own mailbox client over SOEM's datagrams. SOEM's own transfers in one thread would delay
+the images of another: its threads take each other's frames from the socket, and a thread that waits for a frame already
+taken waits for the socket's shortest time, 1 us, which Linux extends to one or two ticks, 4 to 20 ms.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from drive_env.master.ethercat.state_names import refusal, take_to_op
 
 MICROSECONDS = 1e6
 REGISTER_TIMEOUT = 20_000  # us
-# us. SOEM has 2 ms for a frame and 20 ms for room in a mailbox, for a chip and a computer that does nothing else.
+# us. SOEM has 2 ms for a frame and 20 ms for room in a mailbox: enough only for a computer that does nothing else.
 FRAME_TIMEOUT, ROOM_TIMEOUT = 20_000, 200_000
 STATE_LOOK = 0.005  # s between two looks at the slaves' states while images are exchanged
 PATIENCE = 5.0  # s for a state
-PROBE, PROBES = 0.1, 3  # s for an answer that shows that the slave takes our mailbox counter, and how often it is asked
+PROBE, PROBES = 0.1, 3  # s for an answer, which shows that the slave accepts our mailbox counter; number of tries
 HAS_MAIL = 0x08  # of a sync manager's status
 DEVICE_TYPE = 0x1000
 
@@ -40,15 +40,15 @@ class SoemMaster:
     """SOEM on a network interface.
 
     Args:
-        interface: Its name, as eth0.
+        interface: Its name, e.g. eth0.
 
     Raises:
         OpenError: If pysoem is not installed, or the interface cannot be opened.
 
     Attributes:
         alive: Called again and again while an answer is waited for.
-        clock: What `map` sets the distributed clocks to; delays and offsets are SOEM's to measure.
-        system_time: The reference's time that the last exchange has brought [ns].
+        clock: Settings of the distributed clocks for `map`; SOEM measures delays and offsets.
+        system_time: The reference's time from the last exchange [ns].
     """
 
     def __init__(self, interface: str) -> None:
@@ -75,14 +75,14 @@ class SoemMaster:
             ) from None
         self._turn = threading.RLock()  # a frame and its answer
         self._mailboxes: list[MailboxClient] = []
-        self._has_counted: list[bool] = []  # whether the last message to a slave's mailbox was ours
-        self._emergencies: deque[ReceivedEmergency] = deque()  # those that came to SOEM, or to mailboxes of before
+        self._has_counted: list[bool] = []  # whether the last message to a slave's mailbox was sent by our client
+        self._emergencies: deque[ReceivedEmergency] = deque()  # received by SOEM, or by earlier mailbox clients
         self._mapped: dict[int, ImageSizes] = {}
         self._looked, self._states = -math.inf, dict[int, SlaveStatus]()
 
     # --- slaves -----------------------------------------------------------------------------------------------------
     def begin(self) -> int:
-        """Find the slaves, give them addresses, take them to Pre-Op; whatever they did before ends."""
+        """Find the slaves, give them addresses, and take them to Pre-Op, from any state. Returns their number."""
         with self._turn:
             self._mapped.clear()
             count = int(self._master.config_init())
@@ -90,7 +90,7 @@ class SoemMaster:
                 raise NoAnswerError(f"no slave answers on {self._interface}; check cable, power and channel")
             self._keep_emergencies()
             for position, slave in enumerate(self._master.slaves):
-                # What comes while SOEM itself reads an object; untaken, it would be raised there.
+                # Comes while SOEM itself reads an object; if not handled, it would be raised there.
                 slave.add_emergency_callback(lambda one, position=position: self._take_emergency(position, one))
             for position in range(count):
                 self._await(position, AlState.PRE_OP)
@@ -99,12 +99,12 @@ class SoemMaster:
             return count
 
     def recover(self, position: int) -> bool:
-        """Take a slave to Pre-Op; return whether it had restarted, and had no address."""
+        """Take a slave to Pre-Op; return whether it had restarted, and so lost its address."""
         status = self.status(position)
         if status.state in (AlState.PRE_OP, AlState.SAFE_OP, AlState.OP):
             self._request(position, AlState.PRE_OP)
             return False
-        self.begin()  # SOEM gives addresses to all slaves alike
+        self.begin()  # SOEM assigns addresses only to all slaves at once
         return not status.state
 
     def identity(self, position: int) -> SlaveIdentity:
@@ -123,7 +123,7 @@ class SoemMaster:
 
     def _slave(self, position: int) -> Any:
         slaves = self._master.slaves
-        if position >= len(slaves):  # SOEM has found fewer than there were, or none
+        if position >= len(slaves):  # SOEM has found fewer slaves than before
             raise NoAnswerError(f"position {position} does not answer; check cable and power")
         return slaves[position]
 
@@ -135,7 +135,7 @@ class SoemMaster:
         self._await(position, state)
 
     def _await(self, position: int, state: AlState, timeout: float = PATIENCE) -> None:
-        """Wait until a slave is in a state; BusError if it refuses or does not come."""
+        """Wait until a slave is in a state; BusError if it refuses or does not reach it."""
         deadline = time.monotonic() + timeout
         while True:
             status = self.status(position)
@@ -148,7 +148,7 @@ class SoemMaster:
 
     # --- registers --------------------------------------------------------------------------------------------------
     def register(self, position: int, address: int, size: int) -> bytes | None:
-        """Return a slave's register; None where it does not answer."""
+        """Return a slave's register; None if it does not answer."""
         for _ in range(READS):
             with self._turn:
                 found = self._quietly(lambda: self._slave(position)._fprd(address, size, REGISTER_TIMEOUT))
@@ -157,7 +157,7 @@ class SoemMaster:
         return None
 
     def write_register(self, position: int, address: int, data: bytes) -> None:
-        """Write a slave's register; NoAnswerError if it does not take it."""
+        """Write a slave's register; NoAnswerError if it does not accept it."""
         with self._turn:
             try:
                 self._slave(position)._fpwr(address, data, REGISTER_TIMEOUT)
@@ -173,7 +173,7 @@ class SoemMaster:
 
     # --- images -----------------------------------------------------------------------------------------------------
     def map(self, sizes: Mapping[int, ImageSizes]) -> None:
-        """Give the images of all slaves their places, and take them from Pre-Op to Safe-Op."""
+        """Assign addresses to the images of all slaves, and take them from Pre-Op to Safe-Op."""
         with self._turn:
             if self.clock is not None:
                 check_clocks(self, range(len(self._mailboxes)))
@@ -215,7 +215,7 @@ class SoemMaster:
         self._request(position, AlState.PRE_OP)
 
     def exchange(self, outputs: Sequence[bytes], timeout: float) -> list[bytes | None]:
-        """Send the images of the slaves that are mapped and return theirs, in the order of `map`."""
+        """Send the images of the mapped slaves and return their answers, in the order of `map`."""
         with self._turn:
             for position, data in zip(self._mapped, outputs, strict=True):
                 self._slave(position).output = data
@@ -227,7 +227,7 @@ class SoemMaster:
                 self.system_time = int(self._master.dc_time)
             now = time.monotonic()
             if now - self._looked > STATE_LOOK:
-                # A slave that has left Op still answers process data; only its state tells.
+                # A slave that has left Op still answers process data; only its state shows that.
                 self._looked, self._states = now, {position: self.status(position) for position in self._mapped}
             return [bytes(self._slave(k).input) if self._states[k].is_op else None for k in self._mapped]
 
@@ -241,11 +241,11 @@ class SoemMaster:
         self._our_mailbox(position).download(index, sub, data, timeout)
 
     def post(self, position: int, index: int, sub: int, data: bytes) -> None:
-        """Send a short write and wait for no answer, unless a transfer is under way."""
+        """Send a short write without waiting for its answer, unless a transfer is under way."""
         self._our_mailbox(position).post(index, sub, data)
 
     def take_emergencies(self) -> list[ReceivedEmergency]:
-        """Return and forget the emergencies that came."""
+        """Return and forget the received emergencies."""
         for mailbox in self._mailboxes:
             mailbox.look(0.0)
         self._keep_emergencies()
@@ -261,29 +261,29 @@ class SoemMaster:
         self._emergencies.append(ReceivedEmergency(position, one.error_code, one.error_reg, extra))
 
     def _our_mailbox(self, position: int) -> MailboxClient:
-        """Return the client of a slave's mailbox, once the slave takes its counter.
+        """Return the client of a slave's mailbox, after the slave has accepted its counter.
 
-        A slave ignores a message with the counter of the one before, and SOEM does not tell its own.
+        A slave ignores a message with the same counter as the previous one, and SOEM's counter cannot be read.
         """
         mailbox = self._mailboxes[position]
         if not self._has_counted[position]:
             for _ in range(PROBES):
                 with contextlib.suppress(NoAnswerError):
-                    with contextlib.suppress(SdoAbortError):  # an answer, too
+                    with contextlib.suppress(SdoAbortError):  # an abort is an answer, too
                         mailbox.upload(DEVICE_TYPE, 0, PROBE)
                     break
             self._has_counted[position] = True
         return mailbox
 
     def _give_the_mailbox_back(self, position: int) -> None:
-        """Let SOEM send a message that the slave may ignore, so that it takes the next."""
+        """Let SOEM send a message that the slave may ignore, so that it accepts the next."""
         if self._has_counted[position]:
             self._master.sdo_read_timeout = round(PROBE * MICROSECONDS)
             self._quietly(lambda: self._slave(position).sdo_read(DEVICE_TYPE, 0))
             self._has_counted[position] = False
 
     def _mailbox(self, position: int) -> MailboxClient:
-        """Return a client of a slave's mailbox, where SOEM has put it."""
+        """Return a client of a slave's mailbox, at the addresses set by SOEM."""
         found = self.register(position, registers.SYNC_MANAGERS, 2 * registers.SYNC_MANAGER_SIZE)
         if found is None:
             raise NoAnswerError(f"position {position} does not answer; check cable and power")
@@ -312,7 +312,7 @@ class SoemMaster:
         return MailboxClient(write, fetch, repeat, (room, length), lambda: self.alive())
 
     def close(self) -> None:
-        """Take all slaves to Init, as far as they answer, and let go of the interface."""
+        """Take all slaves to Init, as far as they answer, and close the interface."""
         with self._turn:
             if self._mailboxes:
                 self._master.state = int(AlState.INIT)

@@ -1,4 +1,4 @@
-"""How a master takes slaves to states, and what it says of refused or missing ones (ETG.1000.6, table 11; ETG.1020)."""
+"""Names of states, messages about refused states, and the way to Op (ETG.1000.6, table 11; ETG.1020)."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ MEANINGS = {
 
 
 def state_name(state: int) -> str:
-    """Return the name of a state; of one that there is not, its number."""
+    """Return the name of a state; for an undefined state its number."""
     return NAMES[AlState(state)] if state in AlState.__members__.values() else f"state {state}"
 
 
 def refusal(position: int, wanted: AlState, status: SlaveStatus) -> str:
-    """Return a message about a slave that does not come to a state."""
+    """Return a message about a slave that does not reach a state."""
     if not status.state:
         return f"position {position} does not answer; check cable and power"
     code = status.code
@@ -47,7 +47,7 @@ def take_to_op(
     exchange: Callable[[], None] | None,
     timeout: float,
 ) -> None:
-    """Ask slaves for Op until they are there; `exchange` sends images meanwhile. BusError if one refuses."""
+    """Request Op of slaves until all are there; `exchange` sends images meanwhile. BusError if one refuses."""
     for position in positions:
         ask(position)
     deadline = time.monotonic() + timeout

@@ -1,4 +1,4 @@
-"""Modes of operation: the table of modes, and the stage that turns the present mode's targets into demands."""
+"""Modes of operation: the table of modes, and the stage that converts the present mode's targets to demands."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mechanics.kernels.compiled import stage
 
 
 class Mode(NamedTuple):
-    """A row: value of 6060h, abbreviation, name, bit of 6502h (None for no mode), innermost loop with a set-point."""
+    """A row: value of 6060h, abbreviation, name, bit of 6502h (None for "no mode"), innermost loop with a set-point."""
 
     number: int
     abbreviation: str
@@ -38,7 +38,7 @@ TQ, IP, VL = cia402.TQ, cia402.IP, cia402.VL
 
 @stage
 def acts_as(mode):
-    """Return the mode whose generator a mode has: ip is csp and tq is cst on drives that have them (TGZ manual)."""
+    """Return the mode whose generator a mode uses: csp for ip, cst for tq (TGZ manual)."""
     if mode == IP:
         return CSP
     return CST if mode == TQ else mode
@@ -46,10 +46,10 @@ def acts_as(mode):
 
 @stage
 def slow_down_ramp(drive, lane):
-    """Return the deceleration [rad/s^2] of the mode in use; 0 where it is not set, which stops at once.
+    """Return the deceleration [rad/s^2] of the mode in use; 0 if it is not set, which stops at once.
 
-    pv has one ramp for both ways (TMCM-1636 manual, 6083h) but on drives that slow down with 6084h in it, and so has hm
-    (609Ah); cst and no mode have none of their own and take 6084h.
+    pv uses 6083h for both directions (TMCM-1636 manual), except on drives that slow down with 6084h; hm uses 609Ah; cst
+    and "no mode" use 6084h.
     """
     rate = drive.homing_acceleration[lane] if drive.mode_display[lane] == HM else 0.0
     if rate == 0.0:
@@ -69,7 +69,7 @@ def quick_stop_ramp(drive, lane):
 
 @stage
 def stop_ramp(drive, lane):
-    """Return the deceleration of the stop that runs: by 605Ah or 605Eh on the quick stop ramp, else the mode's."""
+    """Return the deceleration of the present stop: the quick stop's if 605Ah or 605Eh say so, else the mode's."""
     state = drive.fsa[lane]
     option = drive.quick_stop_option[lane]
     if state == fsa.REACTING or (state == fsa.STOPPING and (option == 2 or option == 6)):
@@ -79,16 +79,16 @@ def stop_ramp(drive, lane):
 
 @stage
 def lag_of_demand(drive, lane):
-    """Return how far behind its demand the position loop is at the demanded speed; its gain is not 0."""
+    """Return the position loop's lag behind its demand at the demanded speed; its gain must not be 0."""
     return drive.velocity_demand[lane] * (1.0 - drive.feed_forward[lane]) / drive.position_p[lane]
 
 
 @stage
 def start_braking(drive, lane):
-    """Let a stop begin with the motion there is, where the demand does not tell it.
+    """Let a stop begin with the actual motion, if that differs from the demand.
 
-    A torque mode has no speed demand; a set-point of csp may jump; and after a following error the axis is not where
-    the demand is.
+    A torque mode has no speed demand; a set-point of csp may jump; and after a following error the axis is not at its
+    demand.
     """
     level = drive.loop_level[lane]
     if level != 0 and acts_as(drive.mode_display[lane]) != CSP and drive.fsa[lane] != fsa.REACTING:
@@ -114,17 +114,17 @@ def brake(drive, lane, rate, dt):
 
 @stage
 def change_mode(drive, lane):
-    """Make the requested mode the present one, without a jump: demands start from the motion there is."""
+    """Change to the requested mode without a jump: demands start from the actual motion."""
     before = drive.loop_level[lane]
     if before == 0 or acts_as(drive.mode_display[lane]) == CSP:
-        # A set-point of csp may have jumped: its speed for a period is none that the axis has, or could be braked from.
+        # A set-point of csp may have jumped: its speed in one period is not one that the axis has or could brake from.
         drive.velocity_demand[lane] = drive.omega_meas[lane]
     if before != 2:
         drive.position_demand[lane] = drive.theta_meas[lane]
     drive.mode_display[lane] = drive.mode[lane]
     by_position = drive.mode[lane] == PP or drive.mode[lane] == HM or acts_as(drive.mode[lane]) == CSP
     if before != 2 and by_position and drive.position_p[lane] > 0.0:
-        # The position loop asks for the present speed only with the lag that it has at that speed.
+        # The position loop demands the present speed only with its lag at that speed.
         lag = lag_of_demand(drive, lane)
         window = drive.following_error_window[lane]
         if window == 0.0 or abs(lag) < window:
@@ -139,7 +139,7 @@ def change_mode(drive, lane):
 
 @stage
 def may_change_mode(drive, lane):
-    """Return whether the mode that was written takes effect now: after its delay, and where it must be, at a halt."""
+    """Return whether the written mode takes effect now: after its delay and, if the drive needs it, at a halt."""
     if drive.mode_wait[lane] > 0.0:
         return False
     if drive.mode_needs_halt[lane] == 0 or drive.fsa[lane] != fsa.ENABLED:
@@ -149,7 +149,7 @@ def may_change_mode(drive, lane):
 
 @stage
 def request_mode(drive, lane, mode):
-    """Take a write of 6060h: the mode changes at once, where nothing makes it wait."""
+    """Handle a write of 6060h: the mode changes at once, unless it must wait."""
     drive.mode[lane] = mode
     drive.mode_wait[lane] = drive.mode_delay[lane]
     if mode != drive.mode_display[lane] and may_change_mode(drive, lane):
@@ -158,7 +158,7 @@ def request_mode(drive, lane, mode):
 
 @stage
 def asked_direction(drive, lane):
-    """Return the sign of the motion that the targets of the present mode ask for."""
+    """Return the sign of the motion that the targets of the present mode demand."""
     mode = acts_as(drive.mode_display[lane])
     way = 0.0
     if mode == PP:
@@ -178,7 +178,7 @@ def asked_direction(drive, lane):
 
 @stage
 def is_blocked(drive, lane):
-    """Return whether a limit of travel forbids the motion that is asked for; away from it is allowed."""
+    """Return whether a limit of travel forbids the demanded motion; motion away from it is allowed."""
     way = asked_direction(drive, lane)
     blocked = drive.blocked[lane]
     return (way > 0.0 and blocked & protection.BLOCKS_POSITIVE) or (way < 0.0 and blocked & protection.BLOCKS_NEGATIVE)
@@ -217,7 +217,7 @@ def generate_demand(drive, lane, dt):
     if drive.set_point_waiting[lane] == 1 and drive.set_point_valid[lane] == 0:
         pp.empty_buffer(drive, lane)
     mode = acts_as(drive.mode_display[lane])
-    # Whatever moves the demand without bows leaves no acceleration behind for a ramp that has them.
+    # Generators without bows leave no acceleration for a later ramp with bows.
     drive.acceleration_before[lane] = drive.acceleration_demand[lane]
     drive.acceleration_demand[lane] = 0.0
     if drive.drive_function[lane] == 0.0:
@@ -241,7 +241,7 @@ def generate_demand(drive, lane, dt):
         drive.target_reached[lane] = 1 if drive.velocity_demand[lane] == 0.0 else 0
     elif halted and mode != 0 and mode != HM:
         brake(drive, lane, slow_down_ramp(drive, lane), dt)
-        # CiA 402: with halt set, bit 10 tells that the axis has come to rest.
+        # CiA 402: with halt set, bit 10 shows that the axis has come to rest.
         drive.target_reached[lane] = 1 if drive.velocity_demand[lane] == 0.0 else 0
     elif is_blocked(drive, lane):
         brake(drive, lane, quick_stop_ramp(drive, lane), dt)
@@ -258,7 +258,7 @@ def generate_demand(drive, lane, dt):
 
 @stage
 def mode_bits(drive, lane):
-    """Return bit 12 of the statusword as the present mode documents it (tables 148, 217, 237, 263, 283)."""
+    """Return bit 12 of the statusword with its meaning in the present mode (tables 148, 217, 237, 263, 283)."""
     mode = acts_as(drive.mode_display[lane])
     bits = 0
     if mode == PP:

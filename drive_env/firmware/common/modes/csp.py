@@ -10,7 +10,7 @@ from mechanics.kernels.compiled import stage
 
 @stage
 def generate(drive, lane, dt):
-    """Move the position demand to 607Ah + 60B0h within the interpolation period; 607Dh limits it and sets bit 11."""
+    """Move the position demand to 607Ah + 60B0h within the interpolation period; 607Dh limits it, and sets bit 11."""
     drive.loop_level[lane] = 2
     target = drive.target_position[lane] + drive.position_offset[lane]
     if drive.target_is_whole[lane] == 0 and drive.cyclic_wraps[lane] == 1:

@@ -7,10 +7,10 @@ from mechanics.kernels.compiled import stage
 
 @stage
 def generate(drive, lane):
-    """Hand 6071h + 60B2h to the current loop; position demand follows the axis."""
+    """Pass 6071h + 60B2h to the current loop; the position demand follows the axis."""
     drive.loop_level[lane] = 0
     drive.torque_demand[lane] = drive.target_torque[lane] + drive.torque_offset[lane]
     drive.position_demand[lane] = drive.theta_meas[lane]
-    # What a stop ramp starts from.
+    # A stop ramp starts from it.
     drive.velocity_demand[lane] = drive.omega_meas[lane]
     drive.target_reached[lane] = 0

@@ -1,9 +1,9 @@
-"""What csp and csv share: set-points that come once per interpolation period, and the way between them.
+"""Common part of csp and csv: interpolation between set-points that come once per interpolation period.
 
-A set-point is reached one interpolation period (60C2h) after it came, along a straight line from where the demand is.
-One that comes early takes over at once; one that comes twice is planned anew; one that does not come leaves the
-demand at the last one, at rest in csp, at the last velocity in csv. Until the first set-point after enabling or a
-change of mode the axis holds where it is, so a target of yesterday moves nothing.
+A set-point is reached one interpolation period (60C2h) after it came, along a straight line from the present demand. An
+early set-point takes over at once; a repeated one is planned anew; without a new one the demand stays at the last one,
+at rest in csp, at the last velocity in csv. Until the first set-point after enabling or a change of mode the axis holds
+its position, so that an old target does not move it.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ NO_SET_POINT = -1
 
 @stage
 def forget(drive, lane):
-    """Wait for a first set-point; what was written before does not count."""
+    """Wait for a first set-point; earlier ones do not count."""
     drive.set_point_fresh[lane] = 0
     drive.set_point_steps[lane] = NO_SET_POINT
 

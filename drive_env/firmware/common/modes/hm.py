@@ -1,8 +1,8 @@
 """Homing mode (CiA 402-2): methods 1 to 14, 17 to 30, 33 to 35 and 37, -1 to -4 of makers; 0 does nothing.
 
-A switch is searched fast; once it is touched the axis brakes, and looks for the edge slowly, always in the same
+A switch is searched fast; once it is reached the axis brakes and searches the edge slowly, always in the same
 direction, until the switch changes; that edge is home. Then the axis returns to the edge and rests there. Search and
-edge as the methods have them:
+edge of each method:
 
     17  search left until the left limit switch is active, edge to the right where it becomes inactive
     18  search right until the right limit switch is active, edge to the left
@@ -17,12 +17,12 @@ edge as the methods have them:
     -1, -2  right or left, fast, until a mechanical stop holds the axis; its position stays as it was counted
     -3, -4  likewise, and the position is 0 there
 
-A limit switch turns the search for a home switch round. The edge where a switch becomes active is found from the same
-edge where it was left: slowly off it, and back.
+A limit switch reverses the search for a home switch. An edge at which a switch becomes active is found by leaving the
+switch there slowly and returning.
 
 Zero is at home plus 607Ch, so that home itself has the position -607Ch.
 
-A way of more than a turn without an index is one on which none comes: homing fails, rather than run into a stop.
+If no index comes within a turn, homing fails before the axis runs into a stop.
 """
 
 from __future__ import annotations
@@ -39,38 +39,38 @@ LEFT, RIGHT, HOME = 0, 1, 2
     IDLE, SEARCH, TURNED, BRAKE, TO_EDGE, AWAY, RETURN, STOPPED, DONE, FAILED, TO_INDEX, BACK_ON, TO_STOP,
 ) = range(13)  # fmt: skip
 
-BY_SWITCH = 16  # from a method with an index to the one that ends at the switch's edge
+BY_SWITCH = 16  # offset from a method with an index to the one that ends at the switch's edge
 INDEX_LEFT, INDEX_RIGHT = 33, 34
 SEARCH_LEFT = (17, 21, 22, 27, 28, 29, 30)  # the others of 17 to 30 search to the right
-RIGHT_EDGE = (17, 21, 22, 25, 26, 27, 28)  # the others end at the left one
+RIGHT_EDGE = (17, 21, 22, 25, 26, 27, 28)  # the others end at the left edge
 WHERE_ACTIVE = (20, 22, 24, 25, 28, 29)  # the others end where the switch becomes inactive
 HERE = (35, 37)  # CiA 402 has 35 as the older number of 37
-STOPS_RIGHT, SETS_ZERO = (-1, -3), (-3, -4)  # of the methods on a stop
-STALL_TIME, STALL_SHARE = 0.1, 0.1  # s, of the speed: below it so long, a stop holds the axis; decided by us
+STOPS_RIGHT, SETS_ZERO = (-1, -3), (-3, -4)  # methods that end at a stop
+STALL_TIME, STALL_SHARE = 0.1, 0.1  # s, share of the speed: a slower axis is at a stop after this time; our choice
 INDEX_WAY = 1.05 * TWO_PI  # rad in which an index must come
 
 
 @stage
 def _ends_at_index(method):
-    """Return whether a method goes on from the switch's edge to an index."""
+    """Return whether a method continues from the switch's edge to an index."""
     return 0 < method < BY_SWITCH
 
 
 @stage
 def _looks_for_index_alone(method):
-    """Return whether a method looks for the next index, wherever it is."""
+    """Return whether a method searches only the next index."""
     return method in (INDEX_LEFT, INDEX_RIGHT)
 
 
 @stage
 def _by_switch(method):
-    """Return the method that finds the same edge without an index."""
+    """Return the method without an index that finds the same edge."""
     return method + BY_SWITCH if _ends_at_index(method) else method
 
 
 @stage
 def _switch(method):
-    """Return which switch a method looks for, of those without an index."""
+    """Return the switch that a method without an index searches."""
     if method == 17:
         return LEFT
     if method == 18:
@@ -80,7 +80,7 @@ def _switch(method):
 
 @stage
 def _has_switch(drive, lane, method):
-    """Return whether there is the switch that a method looks for; without it the search would never end."""
+    """Return whether the axis has the switch that a method searches; without it the search would never end."""
     return (drive.homing_switches[lane] >> _switch(_by_switch(method))) & 1 == 1
 
 
@@ -92,7 +92,7 @@ def _search_sign(method):
 
 @stage
 def _edge_side(method):
-    """Return on which side of the switch the edge is that a method without an index ends at: -1 left, 1 right."""
+    """Return the side of the switch's edge at which a method without an index ends: -1 left, 1 right."""
     return 1.0 if method in RIGHT_EDGE else -1.0
 
 
@@ -105,7 +105,7 @@ def is_running(drive, lane):
 
 @stage
 def _look_for_index(drive, lane, direction):
-    """Begin to look for the index, in a direction; return the state."""
+    """Begin to search the index in a direction; return the state."""
     drive.homing_direction[lane] = direction
     drive.index_seen[lane] = 0.0
     drive.homing_limit[lane] = drive.theta_meas[lane] + direction * INDEX_WAY
@@ -121,7 +121,7 @@ def start_or_stop(drive, lane, word_before):
         drive.target_reached[lane] = 0
         method = drive.homing_method[lane]
         if method in HERE:
-            # Does not need operation enabled. At rest the demand is zero too, whatever is left of the position error.
+            # Does not need operation enabled. At rest the demand is zero, too, whatever position error remains.
             if drive.velocity_demand[lane] == 0.0:
                 drive.position_demand[lane] = drive.theta_meas[lane]
             offset = 0.0 if drive.homing_here_sets_zero[lane] == 1 else drive.home_offset[lane]
@@ -150,14 +150,14 @@ def start_or_stop(drive, lane, word_before):
 
 @stage
 def forget(drive, lane):
-    """Leave homing: a run that was not finished is none."""
+    """Leave homing: an unfinished run is discarded."""
     drive.homing_state[lane] = IDLE
     drive.homing_attained[lane] = 0
 
 
 @stage
 def set_home(drive, lane, position, value):
-    """Give `position` [rad] the value `value` [rad]; demand and measurement move together, so nothing jumps."""
+    """Assign the value `value` [rad] to `position` [rad]; demand and measurement move together, so nothing jumps."""
     drive.home_count[lane] = (position + drive.home_shift[lane]) * drive.counts_per_turn[lane] / TWO_PI
     shift = position - value
     drive.home_shift[lane] += shift
@@ -185,11 +185,11 @@ def _search(drive, lane, state, active, dt):
     drive.homing_direction[lane] = direction
     if active:
         state = BRAKE
-        # An axis that still comes from the other way leaves a narrow switch on that side.
+        # An axis that still comes from the other side leaves a narrow switch on that side.
         v = drive.velocity_demand[lane]
         drive.homing_direction[lane] = direction if v == 0.0 else (1.0 if v > 0.0 else -1.0)
     elif _switch(method) == HOME and inputs.is_active(drive, lane, RIGHT if direction > 0.0 else LEFT):
-        # The search led away from the switch: it lies on the other side, or nowhere.
+        # The search led away from the switch: it is on the other side, or missing.
         state = TURNED if state == SEARCH else FAILED
     if state in (SEARCH, TURNED):
         _run(drive, lane, (sign if state == SEARCH else -sign) * drive.homing_fast[lane], dt)
@@ -200,7 +200,7 @@ def _search(drive, lane, state, active, dt):
 def _come_to_rest(drive, lane, active, dt):
     """Brake on the switch; return the state after it."""
     _run(drive, lane, 0.0, dt)
-    # The axis lags behind its demand: where it comes to rest decides on which side of the edge it is.
+    # The axis lags behind its demand: its position at rest decides on which side of the edge it is.
     if drive.velocity_demand[lane] == 0.0 and abs(drive.omega_slow[lane]) <= drive.standstill[lane]:
         return TO_EDGE if active else AWAY
     return BRAKE
@@ -218,7 +218,7 @@ def _come_back(drive, lane, edge, active, dt):
 
 @stage
 def _leave_switch(drive, lane, edge, active, dt):
-    """Look for the edge on a side (-1, 1), slowly; return the state after it."""
+    """Search the edge on a side (-1, 1), slowly; return the state after it."""
     if not active and drive.velocity_demand[lane] * edge > 0.0:
         return BACK_ON if _by_switch(drive.homing_method[lane]) in WHERE_ACTIVE else _take_edge(drive, lane, edge)
     if inputs.is_active(drive, lane, RIGHT if edge > 0.0 else LEFT):
@@ -229,7 +229,7 @@ def _leave_switch(drive, lane, edge, active, dt):
 
 @stage
 def _enter_switch(drive, lane, edge, active, dt):
-    """Look for the edge from outside, slowly; return the state after it."""
+    """Search the edge from outside, slowly; return the state after it."""
     if active and drive.velocity_demand[lane] * edge < 0.0:
         return _take_edge(drive, lane, -edge)
     if inputs.is_active(drive, lane, LEFT if edge > 0.0 else RIGHT):
@@ -240,7 +240,7 @@ def _enter_switch(drive, lane, edge, active, dt):
 
 @stage
 def _take_edge(drive, lane, direction):
-    """Take the edge that the axis passes now for home, or go on to the next index; return the state after it."""
+    """Use the edge that the axis passes now as home, or continue to the next index; return the state after it."""
     if _ends_at_index(drive.homing_method[lane]):
         return _look_for_index(drive, lane, direction)
     set_home(drive, lane, drive.theta_meas[lane], -drive.home_offset[lane])
@@ -249,7 +249,7 @@ def _take_edge(drive, lane, direction):
 
 @stage
 def _go_to_index(drive, lane, dt):
-    """Look for the index, slowly; return the state after it."""
+    """Search the index, slowly; return the state after it."""
     direction = drive.homing_direction[lane]
     if drive.index_seen[lane] > 0.0:
         set_home(drive, lane, drive.index_position[lane], -drive.home_offset[lane])
@@ -263,7 +263,7 @@ def _go_to_index(drive, lane, dt):
 
 @stage
 def _go_to_stop(drive, lane, dt):
-    """Move until the axis stands although its speed is asked for; return the state after it."""
+    """Move until the axis stands despite the demanded speed; return the state after it."""
     method, fast = drive.homing_method[lane], drive.homing_fast[lane]
     sign = 1.0 if method in STOPS_RIGHT else -1.0
     _run(drive, lane, sign * fast, dt)
@@ -273,7 +273,7 @@ def _go_to_stop(drive, lane, dt):
         return TO_STOP
     drive.velocity_demand[lane] = 0.0
     drive.position_demand[lane] = drive.theta_meas[lane]
-    drive.velocity_sum[lane] = 0.0  # or the axis would press on
+    drive.velocity_sum[lane] = 0.0  # otherwise the axis would press on
     if method in SETS_ZERO:
         set_home(drive, lane, drive.theta_meas[lane], 0.0)
     drive.homing_attained[lane] = 1

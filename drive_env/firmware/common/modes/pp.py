@@ -7,18 +7,18 @@ from drive_env.firmware.common import fsa, profiles, s_ramp, shaped, six_point
 from drive_env.firmware.common.limits import ROUNDING, corrected_maximum, corrected_minimum
 from mechanics.kernels.compiled import stage
 
-FAR = 1e6  # rad: where a trapezoid aims that is not to brake
+FAR = 1e6  # rad: target of a trapezoid that must not brake
 
 
 @stage
 def new_set_point(drive, lane, word_before):
-    """Take the target position over on the rising edge of controlword bit 4; bit 12 tells it until the bit falls.
+    """Accept the target position on the rising edge of controlword bit 4; bit 12 shows it until bit 4 falls.
 
-    Without a buffer a new edge plans anew from where the axis is, "change set immediately" (bit 5) or not. With one, an
-    edge without bit 5 during a motion puts the set-point into it, and bit 12 stays until it is taken out; one more edge
-    without bit 5 does nothing then (CiA 402-2, profile position mode). With bit 9 (change on set-point) the axis does
-    not stop at the set-point before: it passes it with the profile's velocity, and goes on to the one that waited.
-    Ramps other than trapezoids end at each set-point.
+    Without a buffer a new edge plans anew from the present position, with or without "change set immediately" (bit 5).
+    With a buffer, an edge without bit 5 during a motion puts the set-point into it, and bit 12 stays until it is taken
+    out; another edge without bit 5 has no effect then (CiA 402-2, profile position mode). With bit 9 (change on
+    set-point) the axis does not stop at the previous set-point: it passes it with the profile's velocity, and continues
+    to the buffered one. Ramps other than trapezoids end at each set-point.
     """
     word = drive.controlword[lane]
     if not word & cia402.NEW_SET_POINT:
@@ -48,14 +48,14 @@ def _is_under_way(drive, lane):
 
 @stage
 def _passes(drive, lane):
-    """Return whether the profile goes through its set-point to the one that waits."""
+    """Return whether the profile passes through its set-point to the buffered one."""
     waits = drive.set_point_waiting[lane] == 1
     return waits and drive.waiting_word[lane] & cia402.CHANGE_ON_SET_POINT != 0
 
 
 @stage
 def _follow_trapezoid(drive, lane, v_max, up, down, dt):
-    """Move the demand along a trapezoid to the set-point, or through it to the one that waits."""
+    """Move the demand along a trapezoid to the set-point, or through it to the buffered one."""
     x, v, target = drive.position_demand[lane], drive.velocity_demand[lane], drive.profile_target[lane]
     through = _passes(drive, lane)
     aim = target
@@ -70,14 +70,13 @@ def _follow_trapezoid(drive, lane, v_max, up, down, dt):
 
 @stage
 def _take_waiting(drive, lane):
-    """Take the set-point out of the buffer."""
     _take(drive, lane, drive.waiting_target[lane], drive.waiting_word[lane])
     empty_buffer(drive, lane)
 
 
 @stage
 def empty_buffer(drive, lane):
-    """Have no set-point in the buffer; bit 12 is bit 4's again."""
+    """Empty the buffer; bit 12 follows bit 4 again."""
     drive.set_point_waiting[lane] = 0
     if not drive.controlword[lane] & cia402.NEW_SET_POINT:
         drive.set_point_acknowledged[lane] = 0
@@ -85,7 +84,7 @@ def empty_buffer(drive, lane):
 
 @stage
 def _take(drive, lane, target, word):
-    """Plan the motion to a target [rad], as the controlword of its edge says."""
+    """Plan the motion to a target [rad] by the controlword of its edge."""
     if word & cia402.RELATIVE:
         option = drive.positioning_option[lane] & 3
         if option == 0:
@@ -141,6 +140,6 @@ def generate(drive, lane, ramp, dt):
         drive.in_window_time[lane] += dt
     else:
         drive.in_window_time[lane] = 0.0
-    # The window time is whole milliseconds; half of one keeps the sum's rounding out.
+    # The window time is in whole milliseconds; half of one avoids rounding errors of the sum.
     reached = drive.in_window_time[lane] > drive.position_window_time[lane] + 0.5 * dt
     drive.target_reached[lane] = 1 if reached else 0

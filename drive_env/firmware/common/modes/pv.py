@@ -8,7 +8,7 @@ from mechanics.kernels.compiled import stage
 
 @stage
 def slow_down_ramp(drive, lane):
-    """Return the deceleration of the mode [rad/s^2]: that of 6083h, or of 6084h on drives whose manual has it so."""
+    """Return the deceleration of the mode [rad/s^2]: 6083h, or 6084h on drives whose manual says so."""
     if drive.pv_slows_down_by_6084h[lane] == 1 and drive.deceleration[lane] > 0.0:
         return drive.deceleration[lane]
     return drive.acceleration[lane]
@@ -27,8 +27,8 @@ def begun(drive, lane, v, target):
 def approach(drive, lane, v, target, up, down, dt):
     """Return the velocity [rad/s] after dt [s] of a ramp from v to a target; away from 0 with `up`, to it with `down`.
 
-    On drives that start and stop in this mode, what is slower than the start velocity jumps to it, and what is to
-    stand jumps there from the end velocity.
+    On drives that start and stop in this mode, a speed below the start velocity jumps to it, and a stop jumps to 0 from
+    the end velocity.
     """
     jumps = drive.pv_starts_and_stops[lane] == 1
     reverses = v * target < 0.0
@@ -50,12 +50,12 @@ def approach(drive, lane, v, target, up, down, dt):
 
 @stage
 def generate(drive, lane, dt):
-    """Ramp the velocity demand to 60FFh; bit 10 tells that the ramp has ended.
+    """Ramp the velocity demand to 60FFh; bit 10 shows that the ramp has ended.
 
-    A target beyond 607Fh, where a device has that, is not reached: bit 11 tells so, and bit 10 stays 0.
+    A target beyond 607Fh, if the device has that, is not reached: bit 11 shows it, and bit 10 stays 0.
 
     The position demand follows as the integral of the velocity demand, so that 6062h and the following error window,
-    which the manual lists in this mode, mean something here. A ramp of 0 (factory) does not move. An S-shaped ramp goes
+    which the manual lists in this mode, are meaningful. A ramp of 0 (factory) does not move. An S-shaped ramp slows
     down with 6084h (TMCM-3313 manual, section 7.1.14).
     """
     drive.loop_level[lane] = 1

@@ -1,14 +1,14 @@
 """Velocity mode of frequency inverters (CiA 402-2, IEC 61800-7-201: limit and ramp function, controlword).
 
-The target 6042h is limited by 6046h, and each direction by 6047h besides. A ramp follows it, each way by a speed over a
-time: 6048h, 6049h and 604Ah, or, where these have no speed, 604Eh over 604Fh, 6050h and 6051h. Of the controlword
+The target 6042h is limited by 6046h, and each direction also by 6047h. A ramp follows it, given by a speed over a time:
+6048h, 6049h and 604Ah or, if these have no speed, 604Eh over 604Fh, 6050h and 6051h. In the controlword
 
     bit 4 = 0  the ramp is not used: the axis comes to rest, by 6049h (the standard leaves the way to the maker)
     bit 5 = 0  the ramp's output is held
     bit 6 = 0  the ramp's input is 0
 
-so that an axis that is enabled with none of them does not move, whatever 6042h says. A target of 0 is rest, and
-the least speed holds for the others: a drive may turn at 6046h:01 instead.
+so that an axis enabled with none of them does not move, for any 6042h. A target of 0 means rest; for other targets the
+least speed applies: the drive may turn at 6046h:01 instead.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def rate(speed, time):
 
 @stage
 def speed_up_ramp(drive, lane):
-    """Return the acceleration of the mode [rad/s^2]: 6048h, else 604Eh over 604Fh; 0 where neither is set."""
+    """Return the acceleration of the mode [rad/s^2]: 6048h, else 604Eh over 604Fh; 0 if neither is set."""
     up = rate(drive.vl_acceleration_speed[lane], drive.vl_acceleration_time[lane])
     return up if up > 0.0 else rate(drive.vl_reference[lane], drive.vl_ramp_time[lane])
 
@@ -75,7 +75,7 @@ def ramp_input(drive, lane):
 
 @stage
 def generate(drive, lane, dt):
-    """Ramp the velocity demand to the limited target; bit 11 tells that it is limited, bit 10 that it is reached."""
+    """Ramp the velocity demand to the limited target; bit 11 shows that it is limited, bit 10 that it is reached."""
     drive.loop_level[lane] = 1
     v = drive.velocity_demand[lane]
     word = drive.controlword[lane]
@@ -86,7 +86,7 @@ def generate(drive, lane, dt):
         up = speed_up_ramp(drive, lane)
         down = slow_down_ramp(drive, lane)
         target = ramp_input(drive, lane)
-        if up == 0.0:  # no faster than it is
+        if up == 0.0:  # no faster than now
             target = min(max(target, min(v, 0.0)), max(v, 0.0))
         v_new = pv.approach(drive, lane, v, target, up, down if down > 0.0 else AT_ONCE, dt)
     drive.position_demand[lane] += 0.5 * (v + v_new) * dt
