@@ -154,7 +154,7 @@ def _check_speeds(one: OneAxis, method: int) -> None:
     """Raise ValueError if a speed or the acceleration that a method needs is 0: the axis would not move."""
     from drive_env.drives.homing import missing_speeds
 
-    for (index, sub), example in missing_speeds(one.drives, one.drives.description, one.axis, method).items():
+    for (index, sub), example in missing_speeds(one.drives, one.axis, method).items():
         raise ValueError(
             f"{index:04X}h:{sub:02X} of {one.name} is 0, so method {method} would not move the axis; set it, for "
             f"example drive-env set {index:04X}:{sub} '{example}' --{one.name.replace(' axis', ' --axis')}"

@@ -6,6 +6,7 @@ from typing import Protocol
 
 from numpy.typing import ArrayLike
 
+from drive_env.dictionary.aborts import NO_SUCH_OBJECT, NO_SUCH_SUB_INDEX, ObjectAccessError
 from drive_env.dictionary.entries import ObjectName
 from mechanics.arrays import Integers, Mask
 
@@ -22,3 +23,13 @@ class AxisObjects(Protocol):
 
     def write(self, name: ObjectName, value: ArrayLike, where: Mask | None = None) -> None:
         """Write an object of every axis, or of some."""
+
+
+def read_if_there(drives: AxisObjects, name: ObjectName) -> Integers | None:
+    """Return an object of every axis, None if the drives have no such object."""
+    try:
+        return drives.read(name)
+    except ObjectAccessError as error:
+        if error.abort_code not in (NO_SUCH_OBJECT, NO_SUCH_SUB_INDEX):
+            raise
+        return None

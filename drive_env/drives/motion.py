@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drive_env import cia402
-from drive_env.dictionary.aborts import NO_SUCH_OBJECT, NO_SUCH_SUB_INDEX, ObjectAccessError
+from drive_env.dictionary.aborts import ObjectAccessError
+from drive_env.dictionary.axis_objects import read_if_there
 from drive_env.dictionary.roles import Role
+from drive_env.drives.homing import zero_speeds
 from drive_env.drives.interface import BasicDrives, axis_number
 from mechanics.arrays import Integers, Mask
 
@@ -137,22 +139,12 @@ def stay(drives: BasicDrives, mode: str, where: Mask | None = None) -> None:
         return
     name, added = FOLLOWED[mode]
     still = drives.read(cia402.POSITION_ACTUAL) if name == cia402.TARGET_POSITION else 0
-    offset = None if added is None else _read_if_there(drives, added)
+    offset = None if added is None else read_if_there(drives, added)
     drives.write(name, still if offset is None else still - offset, where=where)
     device: Device | None = getattr(drives, "device", None)
     if name == cia402.TARGET_POSITION and device is not None and Role.TARGET_INSIDE in device.roles:
         # It doubles 607Ah: an image that carries it would restore its old value.
         drives.write(Role.TARGET_INSIDE, drives.read(Role.POSITION_INSIDE), where=where)
-
-
-def _read_if_there(drives: BasicDrives, name: int) -> Integers | None:
-    """Return an object of every axis, None if the drives have no such object."""
-    try:
-        return drives.read(name)
-    except ObjectAccessError as error:
-        if error.abort_code not in (NO_SUCH_OBJECT, NO_SUCH_SUB_INDEX):
-            raise
-        return None
 
 
 def _stay_in_own_mode(drives: BasicDrives, axes: Mask, mode: str | None) -> None:
@@ -521,16 +513,16 @@ def turn(drives: BasicDrives, velocity: ArrayLike, where: Mask | None = None) ->
 
 def turning_mode(drives: BasicDrives) -> str:
     """Return the mode for turning at a velocity: pv, or vl for drives without pv by 6502h, otherwise by 60FFh."""
-    supported = _read_if_there(drives, cia402.SUPPORTED_MODES)
+    supported = read_if_there(drives, cia402.SUPPORTED_MODES)
     if supported is None or not supported.all():  # a drive that does not report its modes
-        return "vl" if _read_if_there(drives, cia402.TARGET_VELOCITY) is None else "pv"
+        return "vl" if read_if_there(drives, cia402.TARGET_VELOCITY) is None else "pv"
     has_vl, has_pv = (supported >> (cia402.MODES[name] - 1) & 1 for name in ("vl", "pv"))
     return "vl" if np.any(has_vl & ~has_pv) else "pv"
 
 
 def is_turning(drives: BasicDrives, axes: Mask, period: float) -> bool:
     """Let a time [s] pass; return whether an axis moved by more than NEAR, or without 6064h is faster by 6044h."""
-    before = _read_if_there(drives, cia402.POSITION_ACTUAL)
+    before = read_if_there(drives, cia402.POSITION_ACTUAL)
     drives.advance(period)
     here = drives.read(cia402.VL_VELOCITY_ACTUAL if before is None else cia402.POSITION_ACTUAL)
     return bool(np.any(np.abs(here - (0 if before is None else before))[axes] > NEAR))
@@ -544,13 +536,20 @@ def home(drives: BasicDrives, where: Mask | None = None, timeout: float = 60.0) 
         TimeoutError: If home is not attained within `timeout` [s].
     """
     axes = np.ones(drives.num_axes, bool) if where is None else where
-    method = _read_if_there(drives, cia402.HOMING_METHOD)
+    method = read_if_there(drives, cia402.HOMING_METHOD)
     if method is not None and (none := axes & (method == 0)).any():
         number = axis_number(drives, int(np.flatnonzero(none)[0]))
         raise RuntimeError(
             f"axis {number} cannot home: no homing method is chosen (6098h is 0); write the number of "
             "the one that fits the machine's switches"
         )
+    for number in np.unique(method[axes]) if method is not None else ():
+        for (index, sub), example, is_zero in zero_speeds(drives, int(number)):
+            if (stuck := axes & (method == number) & is_zero).any():
+                raise RuntimeError(
+                    f"axis {axis_number(drives, int(np.flatnonzero(stuck)[0]))} cannot home: {index:04X}h:{sub:02X} is "
+                    f"0, so method {number} would not move the axis; set it, for example to {example}"
+                )
     enable(drives, mode="hm", where=where)
     with _bit_4_is_low(drives, cia402.ENABLE_OPERATION, where):
         drives.write(cia402.CONTROLWORD, cia402.ENABLE_OPERATION | cia402.NEW_SET_POINT, where=where)

@@ -111,7 +111,7 @@ def home_rows(session: Session, visitor: Visitor) -> None:
         method.props("data-test=homing-method")
 
         async def home() -> None:
-            job = motion_jobs.home(known, visitor.axis, int(method.value))
+            job = motion_jobs.home(visitor.axis, int(method.value))
             await visitor.do(job, f"Home axis {visitor.axis}")
 
         ui.button("Home", icon="home", on_click=home).props("outline no-caps").props("data-test=home")

@@ -14,7 +14,7 @@ from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.access import check_limits
 from drive_env.dictionary.homing_methods import METHODS, method_text
 from drive_env.drives import motion
-from drive_env.drives.homing import methods_of, missing_speeds
+from drive_env.drives.homing import methods_of
 from drive_env.drives.interface import Drives
 from drive_env.drives.lent_object import lent
 from mechanics.arrays import Mask
@@ -95,17 +95,11 @@ def select_mode(axis: int, mode: str) -> MotionJob:
     return lambda drives: motion.select_mode(drives, mode, where=only(drives, axis))
 
 
-def home(known: Description, axis: int, method: int) -> MotionJob:
+def home(axis: int, method: int) -> MotionJob:
     """Return the job that homes an axis by a method, which 6098h has meanwhile; by that of 6098h for 0."""
 
     def job(drives: Drives) -> None:
         where, own = only(drives, axis), int(drives.read(cia402.HOMING_METHOD)[axis])
-        missing = missing_speeds(drives, known, axis, method or own) if method or own else {}
-        for (index, sub), example in missing.items():
-            raise ValueError(
-                f"{index:04X}h:{sub:02X} is 0, so method {method or own} would not move the axis; set it on the page "
-                f"Dictionary, for example to {example}"
-            )
         with nullcontext() if method in (0, own) else lent(drives, cia402.HOMING_METHOD, method, where):
             motion.home(drives, where=where)
 

@@ -72,8 +72,11 @@ def left_high(drives):
 def failed_home(drives):
     drives.write(0x6098, 17)
     drives.write((0x6099, 1), 0)  # by which no homing can begin
-    with pytest.raises(RuntimeError, match="axis 0 did not complete homing: statusword 0637h; check the method 6098h"):
-        motion.home(drives)
+    motion.select_mode(drives, "hm")
+    drives.write(0x6040, 0x1F)
+    drives.advance(0.05)
+    assert (drives.read(0x6041) & 0x3400 != 0x1400).all()  # home is not attained
+    drives.write(0x6040, 0x0F)
     motion.select_mode(drives, "pp")
 
 
@@ -101,10 +104,18 @@ def test_a_move_begins_whatever_was_left_of_bit_4(device, before):
         np.testing.assert_allclose(drives.machine.rotor_angle - start, 0.6 * np.pi, rtol=0.02)
 
 
-def test_a_home_without_a_method_enables_nothing(drives):
-    drives.write(0x6098, 0)
+@pytest.mark.parametrize(
+    ("method", "why"),
+    [
+        (0, "no homing method is chosen"),
+        (17, "6099h:01 is 0, so method 17 would not move the axis; set it, for example to 100 rpm"),
+    ],
+)
+def test_a_home_that_cannot_begin_enables_nothing(drives, method, why):
+    drives.write(0x6098, method)
+    drives.write((0x6099, 1), 0)
     watched = Watched(drives)
-    with pytest.raises(RuntimeError, match="no homing method is chosen"):
+    with pytest.raises(RuntimeError, match=why):
         motion.home(watched)
     assert watched.words == []
 

@@ -301,7 +301,7 @@ def homes(session):
         drives.write((0x6099, 1), 300_000)
         drives.write((0x6099, 2), 30_000)
         drives.write(0x609A, 3_000_000)
-        motion_jobs.home(session.description, 0, 0)(drives)
+        motion_jobs.home(0, 0)(drives)
 
     return job
 

@@ -130,7 +130,7 @@ def _give_speeds(target: Target, axis: int, method: int) -> list[str]:
         ACCELERATION: TORQUE * motor.rated_torque / (ROTORS * motor.inertia),
     }
     lines = []
-    for key in missing_speeds(drives, _description(target), axis, method):
+    for key in missing_speeds(drives, axis, method):
         raw = np.rint(values[key] * target.increments() * per_increment(drives, key)).astype(np.int64)
         drives.write(key, raw, where=_only(target, axis))
         lines.append(f"{key[0]:04X}h:{key[1]:02X} is {raw[axis]}, and was 0")
