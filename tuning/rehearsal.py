@@ -342,10 +342,12 @@ def _limits(target: Target, axis: int) -> Iterator[Check]:
 
 
 def _gains(target: Target, axis: int) -> Iterator[Check]:
-    from tuning.search.trial_bench import first_gains, read_gains
+    from drive_env.drives.raw_gains import read_gains
+    from tuning.search.trial_bench import first_gains
 
-    has, begins = (_named(target, gains(target)[axis]) for gains in (read_gains, first_gains))
-    fresh = " (factory-fresh)" if not read_gains(target)[axis].any() else ""
+    now = read_gains(target.drives)[axis]
+    has, begins = (_named(target, gains) for gains in (now, first_gains(target)[axis]))
+    fresh = "" if now.any() else " (factory-fresh)"
     yield Check("gains", OK, f"now {has}{fresh}; a run begins with {begins}, from the motor's data sheet")
 
 
