@@ -14,7 +14,7 @@ from drive_env.loops.linear_model import Plant
 from drive_env.safety.envelope import swinging_allowed
 from drive_env.trials.positioning import wrapped
 from mechanics.arrays import Floats, Integers, Mask
-from tuning.auto.checks import identified_plant
+from tuning.auto.identified import identified_plant
 from tuning.auto.loop_model import loop_models
 from tuning.auto.stages import IdentifiedAxes
 from tuning.identify.quick_identification import identify_briefly
