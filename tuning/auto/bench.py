@@ -15,7 +15,6 @@ import numpy as np
 from drive_env import cia402
 from drive_env.cia402 import Key
 from drive_env.drives.raw_gains import read_gains
-from drive_env.trials.positioning import wrapped
 from mechanics.arrays import Floats, Integers, Mask
 from tuning.certificate.certificate import TAKEN, Correction
 from tuning.identify.wiring import write_wiring
@@ -141,9 +140,7 @@ class AutoBench:
 
     def room(self) -> tuple[Floats, Floats]:
         """Return how far the rotors may turn from where they are now [rad], down and up, each (num_axes,)."""
-        target = self.target
-        here = wrapped(target.drives.read(cia402.POSITION_ACTUAL) - self._origin) / target.increments()
-        return np.minimum(target.low - here, 0.0), np.maximum(target.high - here, 0.0)
+        return self.target.travel_left(self._origin)
 
     def wire(self, values: Sequence[Mapping[Key, int]]) -> None:
         """Write the settings that wirings need, of every axis; travel and origin become those that are counted then."""

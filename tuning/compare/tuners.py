@@ -97,7 +97,7 @@ def _baseline(target: Target, rng: np.random.Generator) -> Outcome:
         bench = TrialBench(watched)
         bench.identify()
         bench.leave(bench.rule)
-    return _outcome(target, bench.rule, clock.seconds, bench.moves)
+    return _outcome(target, bench.rule, clock.seconds, moves=bench.moves)
 
 
 class RuleTuner:
@@ -156,7 +156,7 @@ def search_tuner(target: Target, rng: np.random.Generator, **settings: Any) -> O
     """Search gains by trials; `settings` are those of `optimise.Settings`."""
     found = optimise(target, Settings(seed=int(rng.integers(2**31)), **settings))
     notes = tuple(note for note in found.notes for _ in range(target.axes_per_machine))
-    return _outcome(target, found.gains, found.drive_seconds, found.moves, found.aborts, notes)
+    return _outcome(target, found.gains, found.drive_seconds, moves=found.moves, aborts=found.aborts, notes=notes)
 
 
 def _search(sampler: str, trials: int, safe: bool = False) -> Tuner:
@@ -198,21 +198,8 @@ _AFTER = (
 )  # fmt: skip
 
 
-def _outcome(
-    target: Target,
-    gains: Integers,
-    seconds: float = 0.0,
-    moves: Integers | None = None,
-    aborts: Integers | None = None,
-    notes: tuple[str, ...] | None = None,
-) -> Outcome:
+def _outcome(target: Target, gains: Integers, seconds: float = 0.0, **counted: Any) -> Outcome:
+    """Return gains and drive time as an outcome, and what was counted; of all else nothing."""
     count = target.num_axes
-    zero = np.zeros(count, np.int64)
-    return Outcome(
-        gains,
-        np.full(count, seconds),
-        zero if moves is None else moves,
-        zero if aborts is None else aborts,
-        zero,
-        ("",) * count if notes is None else notes,
-    )
+    rest = dict.fromkeys(("moves", "aborts", "violations"), np.zeros(count, np.int64)) | {"notes": ("",) * count}
+    return Outcome(gains, np.full(count, seconds), **(rest | counted))

@@ -115,7 +115,9 @@ def joined(found: list[Optimised]) -> Optimised:
     """Return searches as one: gains (searches * axes, count) and cost (searches,) of each, counts of all machines."""
     rows = tuple(row for one in found for row in one.rows)
     notes = tuple(note for one in found for note in one.notes)
-    every = {name: np.concatenate([getattr(one, name) for one in found]) for name in (*OF_AXES, "cost", *OF_ALL)}
+    every: dict[str, Any] = {
+        name: np.concatenate([getattr(one, name) for one in found]) for name in (*OF_AXES, "cost", *OF_ALL)
+    }
     total = {name: sum(getattr(one, name) for one in found) for name in SUMS}
     return replace(found[0], rows=rows, notes=notes, **every, **total)
 
@@ -147,9 +149,7 @@ def _optimised(arrays: Mapping[str, NDArray[Any]], search: int) -> Optimised:
     # Gains stay an array, all else is plain.
     plain = (column if column.ndim == 3 else column.tolist() for column in columns)
     rows = (TrialRow(*values)._replace(search=search) for values in zip(*plain, strict=True))
-    return Optimised(
-        rows=tuple(row._replace(objectives=tuple(row.objectives)) for row in rows),
-        notes=tuple(map(str, arrays["notes"])),
-        **{name: arrays[name] for name in (*OF_AXES, "cost", *OF_ALL)},
-        **{name: arrays[name].item() for name in (*SUMS, "t_0")},
-    )
+    rest: dict[str, Any] = {name: arrays[name] for name in (*OF_AXES, "cost", *OF_ALL)}
+    rest |= {name: arrays[name].item() for name in (*SUMS, "t_0")}
+    listed = tuple(row._replace(objectives=tuple(row.objectives)) for row in rows)
+    return Optimised(rows=listed, notes=tuple(map(str, arrays["notes"])), **rest)
