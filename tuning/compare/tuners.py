@@ -132,7 +132,7 @@ class RuleTuner:
 
 
 def identify_all(target: Target) -> tuple[list[Plant | str], float]:
-    """Identify a target; return what `identified_plants` does, and the drive time that it took [s]."""
+    """Identify a target; return models of its axes, as `identified_plants` does, and the drive time [s]."""
     from tuning.compare.side_by_side import identified_plants
 
     with timed(target) as (watched, clock):

@@ -216,7 +216,7 @@ class MeasuredLoop:
 
 
 def seen_margins(f: Floats, open_loop: Complex, trusted: Mask) -> margins_.Margins:
-    """Return margins of a loop by its trusted lines, arrays (n,), without a gain margin that was not seen.
+    """Return margins of a loop by its trusted lines, arrays (n,), without a gain margin that was not measured.
 
     A phase of -180 degrees that was not reached may lie above the frequencies looked at.
     """
