@@ -89,7 +89,7 @@ def rehearse(target: Target, *, keep: bool = True) -> Rehearsal:
     checks: list[Check] = []
     for axis in range(target.num_axes):
         prefix = f"{_place(target, axis)}: " if target.num_axes > 1 else ""
-        checks += [check._replace(what=prefix + check.what) for check in _checks(target, axis)]
+        checks += [check._replace(what=prefix + check.what) for look in LOOKS for check in look(target, axis)]
     writes = []
     for name, values, why, stays in _plan(target, keep):
         entry = bus_of(target.drives).description.dictionary.find(name)
@@ -101,11 +101,6 @@ def rehearse(target: Target, *, keep: bool = True) -> Rehearsal:
             checks.append(Check(f"object {key[0]:04X}h:{key[1]:02X}", NO, f"{error}"))
         writes.append(Write(key, entry.name, values, why, present, stays))
     return Rehearsal(tuple(checks), tuple(writes))
-
-
-def _checks(target: Target, axis: int) -> Iterator[Check]:
-    for look in LOOKS:
-        yield from look(target, axis)
 
 
 def _read(target: Target, name: Any, axis: int) -> int:
@@ -144,7 +139,6 @@ def _identity(target: Target, axis: int) -> Iterator[Check]:
 
 
 def _state(target: Target, axis: int) -> Iterator[Check]:
-
     status = _read(target, cia402.STATUSWORD, axis)
     names = ("switch on disabled", "ready to switch on", "switched on", "operation enabled", "quick stop", "fault")
     patterns = (cia402.SWITCH_ON_DISABLED, cia402.READY_TO_SWITCH_ON, cia402.SWITCHED_ON, cia402.OPERATION_ENABLED,
@@ -342,10 +336,12 @@ def _limits(target: Target, axis: int) -> Iterator[Check]:
 
 
 def _gains(target: Target, axis: int) -> Iterator[Check]:
-    from tuning.search.trial_bench import first_gains, read_gains
+    from drive_env.drives.raw_gains import read_gains
+    from tuning.search.trial_bench import first_gains
 
-    has, begins = (_named(target, gains(target)[axis]) for gains in (read_gains, first_gains))
-    fresh = " (factory-fresh)" if not read_gains(target)[axis].any() else ""
+    now = read_gains(target.drives)[axis]
+    has, begins = (_named(target, gains) for gains in (now, first_gains(target)[axis]))
+    fresh = "" if now.any() else " (factory-fresh)"
     yield Check("gains", OK, f"now {has}{fresh}; a run begins with {begins}, from the motor's data sheet")
 
 

@@ -24,7 +24,8 @@ from drive_env.drives.chosen_axes import ChosenAxes, chosen_parts
 from drive_env.drives.interface import Drives, Observer
 from drive_env.drives.observed import ObservedDrives
 from drive_env.drives.speeds import per_increment
-from mechanics.arrays import Floats, Mask
+from drive_env.trials.positioning import wrapped
+from mechanics.arrays import Floats, Integers, Mask
 from tuning.lateness import Punctuality, late_first
 from tuning.stop_causes import ToldCauses
 
@@ -136,6 +137,15 @@ class Target:
     def increments(self) -> Floats:
         """Return the position increments per radian of every rotor, 2058h over 2 pi, shape (num_axes,)."""
         return np.asarray(self.drives.read(Role.POSITION_SCALE), float) / (2.0 * math.pi)
+
+    def travel_left(self, origin: Integers) -> tuple[Floats, Floats]:
+        """Return how far the rotors may turn from where they are now [rad], down and up, each (num_axes,).
+
+        Args:
+            origin: Where they were when the target was made [inc], (num_axes,).
+        """
+        here = wrapped(self.drives.read(cia402.POSITION_ACTUAL) - origin) / self.increments()
+        return np.minimum(self.low - here, 0.0), np.maximum(self.high - here, 0.0)
 
     def speed_counts(self) -> Floats:
         """Return the counts of 606Ch and 60FFh per rad/s of every rotor, shape (num_axes,)."""

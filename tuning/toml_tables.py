@@ -67,6 +67,10 @@ def toml_lines(record: Any) -> list[str]:
     return [f"{name} = {toml(value)}" for name, value in values.items() if value is not None]
 
 
-def toml(value: str | int | float) -> str:
-    """Return a value as TOML; a float with all its digits."""
-    return json.dumps(value) if isinstance(value, str) else repr(value)
+def toml(value: Any) -> str:
+    """Return a value as TOML; a float with all its digits, what TOML does not have, as a path, as text."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(toml, value))}]"
+    return repr(value) if isinstance(value, int | float) else json.dumps(str(value))

@@ -24,8 +24,8 @@ from drive_env.devices import find_device
 from drive_env.devices.gains import bandwidth_gains, check_linear_model, gains_in_si
 from drive_env.loops.linear_model import OPEN_LOOPS, Plant
 from drive_env.motors import find_motor
-from tuning.auto.checks import unsafe_gains
 from tuning.auto.design import Judge, design
+from tuning.auto.identified import unsafe_gains
 from tuning.auto.loop_model import LoopModel, one_axis
 from tuning.auto.one_button import auto
 from tuning.auto.twin import Known, Twins, gain_bounds

@@ -23,6 +23,7 @@ from tuning.auto.identified import calm_gains
 from tuning.auto.proving import RESTLESS, Proof, ProvingGround
 from tuning.auto.stages import RecordedGains
 from tuning.auto.twin import Known
+from tuning.certificate.certificate import TAKEN, Correction
 from tuning.target import emulated
 
 DEVICE, STANDARD = find_device("tmcm1636"), find_dynamics("standard")
@@ -201,6 +202,32 @@ def test_a_twin_of_an_axis_that_did_not_rest_has_less_to_hold_it_still(restless,
     swing = np.array([1.01 * RESTLESS if restless else RESTLESS])
     found = design._known(bench, basis_, recorded([FIRST], swing=swing), 0)
     assert (found.coulomb, found.viscous, found.reach) == (pytest.approx(0.5 * share), 0.01, 2.0)
+
+
+OVERSHOT, AGAIN = "a step overshoots by 24 %", "gains designed again from what was measured: a step overshoots by 24 %"
+
+
+OLD, NEW, NEWER = (900, 400), (800, 400), (700, 350)
+
+
+@pytest.mark.parametrize(("kept", "undone", "outcomes"), [
+    (NEW, (), [TAKEN, TAKEN]),
+    (OLD, (1,), [TAKEN, "no better"]),
+    (OLD, (0, 1), ["no better", "no better"]),
+    (NEWER, (1,), [TAKEN, TAKEN]),  # which are the same
+])  # fmt: skip
+def test_a_correction_says_what_gave_way_why_and_whether_it_stayed(kept, undone, outcomes):
+    journal = Journal()
+    for number, (old, new) in enumerate(((OLD, NEW), (NEW, NEWER))):
+        journal.note(AGAIN)
+        journal.correct(np.array(old), np.array(new), OVERSHOT)
+        journal.correct(np.array(new), np.array(new), "as its other axes were")  # which changes nothing here
+        if number in undone:
+            journal.undo(np.array(new), np.array(kept), "no better")
+            journal.undo(np.array(new), np.array(kept), "the gains before are kept")  # it was undone already
+    rows = zip(((OLD, NEW), (NEW, NEWER)), outcomes, strict=True)
+    assert journal.corrections == [Correction(old, new, OVERSHOT, outcome) for (old, new), outcome in rows]
+    assert journal.notes == [AGAIN if one == TAKEN else f"{AGAIN}; {one}" for one in outcomes]
 
 
 def test_there_are_two_corrections_at_most(monkeypatch):

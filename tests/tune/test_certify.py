@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from rigs.auto_stages import recorded
 from rigs.known_machines import true_plant
 
 from drive_env.devices import find_device
@@ -17,11 +15,10 @@ from drive_env.loops.linear_model import OPEN_LOOPS
 from drive_env.loops.margins import Margins, margins
 from drive_env.loops.sampled import CascadeGains, LoopRates, open_loops
 from drive_env.loops.true_plant import true_machines
-from tuning.auto.bench import Journal
 from tuning.auto.certify import certificate, requirements
 from tuning.auto.measured_margins import MeasuredAxis
-from tuning.auto.result import AxisResult, Result, collect
-from tuning.certificate.certificate import CROSSOVERS, KEPT, NEARLY_KEPT, NOT_KEPT, NOT_MEASURED, SEEN_KEPT, TAKEN
+from tuning.auto.result import AxisResult, Result
+from tuning.certificate.certificate import CROSSOVERS, KEPT, NEARLY_KEPT, NOT_KEPT, NOT_MEASURED, SEEN_KEPT
 from tuning.response import frequency_response
 from tuning.response.measured_loop import AtLeast
 from tuning.target import emulated
@@ -104,35 +101,3 @@ def test_of_all_that_the_dynamics_ask_for_it_is_said_whether_it_is_kept(name, gi
 def test_where_nothing_was_measured_nothing_is_said_to_be_kept():
     rows = requirements(STANDARD, AxisResult((1,) * 5, (1,) * 5), KNOWN)
     assert {row.kept for row in rows} == {NOT_MEASURED} and len(rows) == 7
-
-
-# --- what gave way to what --------------------------------------------------------------------------------------------
-FIRST, SECOND, THIRD = (4000, 1500, 900, 300, 500), (4000, 1500, 900, 300, 400), (4000, 1500, 800, 300, 350)
-OVERSHOT = "a step of its set-point in csp overshoots by 24 %"
-
-
-@pytest.mark.parametrize(("steps", "final", "is_kept", "outcomes"), [
-    ([], FIRST, False, []),
-    ([(FIRST, SECOND), (SECOND, THIRD)], THIRD, False, [TAKEN, TAKEN]),
-    ([(FIRST, SECOND), (FIRST, THIRD)], THIRD, False, ["no better as measured: the old ones stay", TAKEN]),
-    ([(FIRST, SECOND)], FIRST, False, ["no better as measured: the old ones stay"]),
-    ([(FIRST, SECOND)], (1,) * 5, True, ["the gains before are kept"]),
-])  # fmt: skip
-def test_a_correction_says_what_gave_way_why_and_whether_it_stayed(steps, final, is_kept, outcomes):
-    journal = Journal()
-    for old, new in steps:
-        journal.note(f"gains designed again from what was measured: {OVERSHOT}")
-        journal.correct(np.array(old), np.array(new), OVERSHOT)
-        journal.correct(np.array(new), np.array(new), "as its other axes were")  # which changes nothing here
-    bench = SimpleNamespace(
-        journals=[journal], before=np.ones((1, 5), np.int64), ground=None, spent=np.zeros(1), dynamics=STANDARD,
-        target=SimpleNamespace(num_axes=1, drives=SimpleNamespace(time_waits=True, bus=None, observers=())),
-    )  # fmt: skip
-    identified = SimpleNamespace(found=(None,), plants=(None,))
-    left = recorded(np.array([final]), kept=np.array([is_kept]))
-    (axis,) = collect(bench, identified, left, Path("before.toml"), False).axes
-    assert [(c.old, c.new, c.reason, c.outcome) for c in axis.corrections] == [
-        (old, new, OVERSHOT, outcome) for (old, new), outcome in zip(steps, outcomes, strict=True)
-    ]
-    again = f"gains designed again from what was measured: {OVERSHOT}"
-    assert list(axis.notes) == [again if one == TAKEN else f"{again}; {one}" for one in outcomes]

@@ -18,7 +18,7 @@ from drive_env.bus.server import Server
 from drive_env.bus.world import World
 from drive_env.devices import find_device
 from drive_env.drives.observed import ObservedDrives
-from drive_env.drives.raw_gains import write_gains
+from drive_env.drives.raw_gains import read_gains, write_gains
 from drive_env.motors import find_motor
 from drive_env.trials.gain_trial import Trials, measured_cost, softness
 from drive_env.trials.method import Cascade
@@ -28,7 +28,7 @@ from tuning.drive_audit import KINDS, DriveAudit
 from tuning.search import optimise as optimise_module
 from tuning.search import trial_bench
 from tuning.search.optimise import SAFE_STEP, Settings, optimise
-from tuning.search.trial_bench import OBJECTIVES, TrialBench, first_gains, read_gains
+from tuning.search.trial_bench import OBJECTIVES, TrialBench, first_gains
 from tuning.search.trials_files import load_options
 from tuning.target import Target, emulated
 
@@ -165,7 +165,7 @@ def test_what_oscillates_is_stopped_and_has_the_last_good_gains_again(rigid):
     tried = bench.run(gains)
     assert tried.aborted.tolist() == [False, True, False, False]
     assert bench.aborts.tolist() == [0, 1, 0, 0]
-    np.testing.assert_array_equal(read_gains(rigid)[1], bench.rule[1])
+    np.testing.assert_array_equal(read_gains(rigid.drives)[1], bench.rule[1])
     assert np.all(cia402.matches(rigid.drives.read(0x6041), cia402.OPERATION_ENABLED))
 
 
@@ -243,7 +243,7 @@ def test_what_shakes_on_with_the_last_good_gains_is_calmed_and_said():
 @pytest.mark.parametrize("sampler", ["random", "grid", "tpe", "cmaes"])
 def test_a_search_ends_with_the_best_of_its_trials_on_the_drives(rigid, sampler):
     found = optimise(rigid, Settings(sampler=sampler, trials=9, seed=2))
-    np.testing.assert_array_equal(read_gains(rigid), found.gains)
+    np.testing.assert_array_equal(read_gains(rigid.drives), found.gains)
     for machine in range(4):
         rows = [row for row in found.rows if row.search == machine]
         assert len(rows) == 9
@@ -319,7 +319,7 @@ def test_the_axes_of_a_machine_are_searched_as_one(load):
     machines = [m for m in load_suite() if m.load == load][:1]
     with open_group(machines) as target:
         found = optimise(target, replace(FEW, trials=5, safe=True))
-        np.testing.assert_array_equal(read_gains(target), found.gains)
+        np.testing.assert_array_equal(read_gains(target.drives), found.gains)
     axes = len(found.rule)
     assert axes == {"gantry": 2, "robot": 6}[load]
     assert [row.gains.shape for row in found.rows] == [(axes, 5)] * len(found.rows)
@@ -430,7 +430,7 @@ def test_a_search_runs_on_one_axis_of_a_bus_inside_the_envelope():
         leave_oscillations_to_trials(drives)
         target = free_axis(drives)
         found = optimise(target, Settings(trials=5, safe=True))
-        np.testing.assert_array_equal(read_gains(target), found.gains)
+        np.testing.assert_array_equal(read_gains(target.drives), found.gains)
     costs = [row.cost for row in found.rows]
     assert len(costs) == 5 and min(costs) == found.cost[0] < costs[0]
 
@@ -443,7 +443,7 @@ def test_a_stop_by_the_envelope_is_an_abort():
         bench.incumbent = bench.rule.copy()
         tried = bench.run(WILD[None])
         assert tried.aborted.tolist() == [True] and tried.cost[0] == math.log(30.0)
-        np.testing.assert_array_equal(read_gains(target), bench.rule)
+        np.testing.assert_array_equal(read_gains(target.drives), bench.rule)
         assert not bench.run(bench.rule).aborted.any()
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import closing
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -40,6 +41,30 @@ def test_nothing_near_the_oracle_keeps_the_constraints_and_is_better(machine):
 def test_another_seed_ends_as_well():
     first, second = (search_oracle(RIGID, seed=seed).performance for seed in (0, 1))
     assert first == pytest.approx(second, rel=0.03)
+
+
+@pytest.mark.parametrize(
+    ("slacks", "runs"), [([-1.0, 0.1], [3, 16, 16, 16]), ([0.1], [3, 16]), ([-1.0, -1.0], [3, 16, 16, 16])]
+)
+def test_where_all_finalists_hunt_in_some_place_every_run_counts_in_the_search(slacks, runs, monkeypatch):
+    asked, left = [], list(slacks)
+
+    class Judge:
+        def __init__(self, group, num_threads, repeats=16, copies=1, dynamics=None):
+            asked.append(repeats)
+
+        def score(self, gains):
+            slack = np.full(len(gains), left.pop(0))
+            return SimpleNamespace(robust_cost=1.0 - slack, performance=np.ones(len(gains)), slack=slack)
+
+        def close(self):
+            pass
+
+    monkeypatch.setattr(module, "Yardstick", Judge)
+    monkeypatch.setattr(module._Box, "of", lambda yardstick: None)
+    monkeypatch.setattr(module, "_evolved", lambda yardstick, box, rng: np.ones((48, 1, 5), np.int64))
+    assert search_oracle(RIGID).slack == slacks[-1]
+    assert asked == runs and not left
 
 
 def test_what_is_kept_are_gains_and_their_figures_are_scored_anew(monkeypatch):

@@ -12,7 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from drive_env.devices.gains import rule_gains
-from drive_env.drives.raw_gains import write_gains
+from drive_env.drives.raw_gains import read_gains, write_gains
 from drive_env.trials.positioning import plan_move
 from drive_env.trials.score import RobustScore
 from tuning.commands.cli import app
@@ -28,7 +28,6 @@ from tuning.outcome import Outcome
 from tuning.runs.pools import open_pool
 from tuning.runs.shard_log import ShardLog
 from tuning.search.optimise import Optimised, Settings, TrialRow
-from tuning.search.trial_bench import read_gains
 from tuning.search.trials_files import trials_figure
 
 RIGID = [m for m in load_suite() if m.load == "inertia" and m.motor == "qbl4208"]
@@ -65,14 +64,14 @@ def moves_and_slows(target, rng):
     motion.enable(target.drives, mode="pp")
     motion.start_move(target.drives, 10_000)
     target.drives.advance(0.3)
-    gains = np.maximum(read_gains(target) // 5, 1)
+    gains = np.maximum(read_gains(target.drives) // 5, 1)
     write_gains(target.drives, gains)
     return outcome(target, gains, "slowed")
 
 
 def shakes(target, rng):
     """Take gains with which the velocity loop oscillates, which is worse than the rule anywhere."""
-    gains = read_gains(target)
+    gains = read_gains(target.drives)
     gains[:, 2] *= 60
     write_gains(target.drives, gains)
     return outcome(target, gains, "shaken")
@@ -98,7 +97,7 @@ def test_the_cost_is_the_robust_cost_of_the_machine():
     with open_group(RIGID) as target:
         hidden.set_machines(target.drives.machine.parameters, target.supply)
         hidden.set_moves(plan_move(target.motor, inertia, target.drives.read((0x2058, 0)), np.full(4, np.inf)))
-        expected = hidden.score(read_gains(target))
+        expected = hidden.score(read_gains(target.drives))
     hidden.close()
     assert [row.robust_cost for row in found.rows] == pytest.approx(expected.robust_cost)
     assert [row.performance for row in found.rows] == pytest.approx(expected.performance)
@@ -151,7 +150,7 @@ def test_a_summary_is_of_all_machines():
 @pytest.mark.slow
 def test_what_a_tuner_does_not_vouch_for_is_not_accepted():
     def doubts(target, rng):
-        return outcome(target, read_gains(target))._replace(accepted=np.array([True, False, True, True]))
+        return outcome(target, read_gains(target.drives))._replace(accepted=np.array([True, False, True, True]))
 
     found = compare(RIGID, {"doubts": doubts, "broken": breaks})
     assert [row.accepted for row in found.of("doubts")] == [True, False, True, True]
@@ -174,7 +173,7 @@ def test_a_violation_is_named():
         motion.enable(target.drives, mode="pp")
         motion.start_move(target.drives, int(0.8 * 65536))
         target.drives.advance(0.5)
-        return outcome(target, read_gains(target))
+        return outcome(target, read_gains(target.drives))
 
     (row,) = compare(SHORT, {"runs off": runs_off}).rows
     assert row.violations == 1 and row.kinds == "left its travel 1"
@@ -437,7 +436,7 @@ def test_a_run_that_is_interrupted_prints_the_figures_it_has(monkeypatch, tmp_pa
         calls.append(target.machine)
         if len(calls) == 2:
             raise KeyboardInterrupt
-        return outcome(target, read_gains(target))
+        return outcome(target, read_gains(target.drives))
 
     register(monkeypatch, Entry("stops", lambda: stops))
     result = run("rank", "-t", "stops", "--count", 2, "--out", tmp_path / "out")

@@ -522,7 +522,7 @@ def test_axes_without_an_inertia_have_a_reason_in_place_of_a_model(monkeypatch):
         drives=SimpleNamespace(safety=None), device=DEVICE, motor=MOTOR, supply=np.array([30.0, 24.0])
     )
     monkeypatch.setattr(side_by_side, "swinging_allowed", lambda drives: nullcontext())
-    one, other = side_by_side.identified_plants(target, said.append)
+    _, (one, other) = side_by_side.identified_plants(target, lambda what, share: said.append(share))
     assert (one.supply, one.inertia) == (30.0, 2e-5) and said == [0.5]
     assert other == "the axis has no identified inertia: the travel is too short"
     assert list(side_by_side.proposals(target, one, ["simc", "imc"])) == ["simc", "imc"]
@@ -541,7 +541,7 @@ def test_relay_experiments_have_the_rules_current_loops_and_drives_their_own_gai
         return swing
 
     monkeypatch.setattr("tuning.rules.relay.relay_experiment", experiment)
-    monkeypatch.setattr("tuning.search.trial_bench.read_gains", lambda target: "before")
+    monkeypatch.setattr(side_by_side, "read_gains", lambda drives: "before")
     monkeypatch.setattr(
         side_by_side,
         "write_gains",

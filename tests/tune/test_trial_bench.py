@@ -24,7 +24,6 @@ from tuning.search.trial_bench import (
     Tried,
     first_gains,
     leave_oscillations_to_trials,
-    read_gains,
 )
 from tuning.search.trial_log import LoggedTrials
 
@@ -495,7 +494,6 @@ def test_the_envelope_leaves_oscillations_and_pauses_of_a_minute_to_trials():
     assert len(changed) == 1
 
 
-def test_first_gains_are_the_methods_and_those_that_are_the_drives(monkeypatch):
+def test_first_gains_are_the_methods():
     target = target_of(Standing())
     assert first_gains(target).tolist() == method_of(DEVICE, MOTOR).first(target.supply).tolist()
-    assert read_gains(target).tolist() == [[65536] * 5] * 4

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,7 +15,6 @@ import numpy as np
 from drive_env import cia402
 from drive_env.cia402 import Key
 from drive_env.drives.raw_gains import read_gains
-from drive_env.trials.positioning import wrapped
 from mechanics.arrays import Floats, Integers, Mask
 from tuning.certificate.certificate import TAKEN, Correction
 from tuning.identify.wiring import write_wiring
@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 # Drive time of the parts [s]: a frequency response of an axis; a trial, with what recovery takes; a move for the
 # record; and one from where a response has ended.
 RESPONSE_TIME, TRIAL_TIME, MOVE_TIME, LOOK_BACK_TIME = 2.3, 0.85, 0.8, 1.3
+
+REDESIGNED = "gains designed again from what was measured: "  # how the note on them begins
 
 
 class Journal:
@@ -63,6 +65,17 @@ class Journal:
         """Add that gains, raw, (count,), gave way to others, unless they are the same."""
         if not np.array_equal(old, new):
             self.corrections.append(Correction(tuple(map(int, old)), tuple(map(int, new)), reason, outcome))
+
+    def undo(self, new: Integers, old: Integers, outcome: str) -> None:
+        """Say why gains designed again last, raw, (count,), gave way to others, unless they are the same."""
+        last = self.corrections[-1] if self.corrections else None
+        if last is None or last.outcome != TAKEN or np.array_equal(new, old):
+            return
+        self.corrections[-1] = replace(last, outcome=outcome)
+        for k in reversed(range(len(self.notes))):
+            if self.notes[k] == f"{REDESIGNED}{last.reason}":
+                self.notes[k] += f"; {outcome}"
+                break
 
 
 class AutoBench:
@@ -127,9 +140,7 @@ class AutoBench:
 
     def room(self) -> tuple[Floats, Floats]:
         """Return how far the rotors may turn from where they are now [rad], down and up, each (num_axes,)."""
-        target = self.target
-        here = wrapped(target.drives.read(cia402.POSITION_ACTUAL) - self._origin) / target.increments()
-        return np.minimum(target.low - here, 0.0), np.maximum(target.high - here, 0.0)
+        return self.target.travel_left(self._origin)
 
     def wire(self, values: Sequence[Mapping[Key, int]]) -> None:
         """Write the settings that wirings need, of every axis; travel and origin become those that are counted then."""

@@ -76,11 +76,12 @@ def certificate(target: Target, result: Result, seed: int, tuner: str = "auto") 
 def _axis(target: Target, result: Result, axis: int, outcome: AxisResult) -> AxisCertificate:
     supply = float(target.supply[axis])
     loaded = [result.loaded[axis]] if axis in result.loaded else []
+    passed = "all checks that could be made passed" if outcome.reservations else "all checks passed"
     return AxisCertificate(
         axis=target.axis_numbers[axis],
         accepted=outcome.accepted,
         reservations=outcome.reservations,
-        reason=outcome.reason or f"{_opening(outcome)}; the gains were verified {outcome.verified}",
+        reason=outcome.reason or f"{passed}; the gains were verified {outcome.verified}",
         identified={} if outcome.identified is None else identified(outcome.identified, target.motor),
         before=outcome.before,
         after=outcome.after,
@@ -96,10 +97,6 @@ def _axis(target: Target, result: Result, axis: int, outcome: AxisResult) -> Axi
         hardware_seconds=float(result.drive_seconds[axis]),
         aborts=int(result.aborts[axis]),
     )
-
-
-def _opening(outcome: AxisResult) -> str:
-    return "all checks passed" if not outcome.reservations else "all checks that could be made passed"
 
 
 def requirements(dynamics: Dynamics, outcome: AxisResult, gains: GainSet) -> tuple[Requirement, ...]:

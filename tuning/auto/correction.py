@@ -13,7 +13,7 @@ from drive_env.loops.dynamics import find_dynamics
 from drive_env.safety.envelope import SafetyError
 from drive_env.trials.score import TRIP, robust_cost
 from mechanics.arrays import Floats, Integers, Mask
-from tuning.auto.bench import MOVE_TIME, TRIAL_TIME
+from tuning.auto.bench import MOVE_TIME, REDESIGNED, TRIAL_TIME
 from tuning.auto.design import design_axes
 from tuning.auto.loop_margins import MEASURED, OVERSHOOT_ERROR, measure, measured_axis
 from tuning.auto.moves import load, show, step
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 CORRECTIONS = 2
 UNSEEN = "no loop was measured, so soft dynamics are asked of the model"
+NO_BETTER = "no better as measured: the old ones stay"
 WORTH = 0.85  # of the robust cost on the twins: what is better by less is not worth a correction
 # Velocity P passes the encoder's noise and counts on to the current, whose swing goes about with its square: what it is
 # lowered to where an axis does not rest; position P likewise where a step overshoots.
@@ -93,6 +94,8 @@ def correct(
                 no_better &= ~bench.whole_machines(
                     (recorded.failed == "") & np.isnan(best.slack) & np.isnan(recorded.slack)
                 )
+                for k in map(int, np.flatnonzero(changed & no_better)):
+                    bench.journals[k].undo(recorded.gains[k], best.gains[k], NO_BETTER)
                 recorded = recorded.mixed(best, changed & no_better)
             best = recorded
         if number == CORRECTIONS:
@@ -211,7 +214,7 @@ def _try(
     passed = bench.whole_machines(proof.passed & where)
     for k in map(int, np.flatnonzero(passed)):
         reason = why[k] or "as its other axes were"
-        bench.journals[k].note(f"gains designed again from what was measured: {reason}")
+        bench.journals[k].note(f"{REDESIGNED}{reason}")
         bench.journals[k].correct(recorded.gains[k], gains[k], reason)
     fresh = replace(
         RecordedGains.only(gains), proof=proof.cost, verified=recorded.verified, unseen=recorded.unseen,

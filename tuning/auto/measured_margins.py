@@ -9,13 +9,15 @@ import numpy as np
 
 from drive_env.loops.dynamics import OFF_NOMINAL
 from drive_env.loops.linear_model import controllers, velocity_filter_response, velocity_plant
-from drive_env.loops.margins import Margins, is_as_stable, margins
+from drive_env.loops.margins import is_as_stable
 from drive_env.trials.score import VARIANTS
 from mechanics.arrays import Complex, Floats, Integers
+from tuning.response.measured_loop import seen_margins
 
 if TYPE_CHECKING:
     from drive_env.loops.dynamics import Dynamics
     from drive_env.loops.linear_model import Plant
+    from drive_env.loops.margins import Margins
     from tuning.response.measured_loop import MeasuredLoop
 
 AT_ONCE = 64  # sets of gains whose loops are computed at once
@@ -62,11 +64,7 @@ class MeasuredAxis:
     def margins(self, gains: Integers) -> dict[str, Margins]:
         """Return the margins of the judged loops with gains, (count,)."""
         loops = self.open_loops(gains[None])
-        found = {loop: margins(self._f, loops[loop][0], self._trusted) for loop in LOOPS}
-        # A phase of -180 degrees that was not reached may lie above the frequencies looked at.
-        return {
-            loop: one if math.isfinite(one.gain_db) else one._replace(gain_db=math.nan) for loop, one in found.items()
-        }
+        return {loop: seen_margins(self._f, loops[loop][0], self._trusted) for loop in LOOPS}
 
     def slack(self, dynamics: Dynamics, gains: Integers) -> Floats:
         """Return how far the judged loops keep the dynamics with gains, relative, (sets,); with other velocity P, too.

@@ -166,6 +166,7 @@ def keep_what_is_better(bench: AutoBench, basis: Basis, recorded: RecordedGains,
     if not kept.any():
         return recorded
     for k in map(int, np.flatnonzero(kept)):
+        bench.journals[k].undo(recorded.gains[k], basis.before[k], "the gains before are kept")
         bench.journals[k].note(
             f"the gains before are kept: the measured cost J of a move was {now[k]:.2f} with the new gains and "
             f"{before[k]:.2f} with the gains before"

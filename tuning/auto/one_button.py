@@ -5,7 +5,7 @@ Everything acts through the Drives interface, on all axes of a target at the sam
 Gains are designed on digital twins, which costs no drive time, and corrected by what the drives show. `auto` calls the
 stages in this order, and what they hand on is in stages.py:
 
-1. identify: identified.py, with the wiring and the motor's parameters (settings.py) and checks (checks.py);
+1. identify: identified.py, with the wiring and the motor's parameters (settings.py);
 2. design: design.py, on twins (twin.py) and their linear models (loop_model.py);
 3. try: trying.py, in trials on the drives (proving.py);
 4. verify and correct: correction.py, by moves (moves.py) and measured loops (loop_margins.py, measured_margins.py);

@@ -1,8 +1,8 @@
 """Trials of gains on the drives: a move, its reversal and a gain probe.
 
 An axis that oscillates or goes into fault is stopped within 50 ms and gets gains that are known to be stable. On a bus
-the safety envelope may be faster: it quick-stops all drives, and the trial is repeated axis by axis to find which axis
-    caused it.
+the safety envelope may be faster: it quick-stops all drives, and the trial is repeated machine by machine to find which
+one caused it.
 """
 
 from __future__ import annotations

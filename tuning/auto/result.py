@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from mechanics.arrays import Floats, Integers, Mask
-from tuning.certificate.certificate import TAKEN, verdict
+from tuning.certificate.certificate import verdict
 from tuning.lateness import late_first
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from drive_env.loops.dynamics import Dynamics
     from drive_env.loops.linear_model import Plant
     from drive_env.loops.margins import Margins
@@ -112,15 +110,14 @@ def collect(bench: AutoBench, identified: IdentifiedAxes, recorded: RecordedGain
     for k, journal in enumerate(bench.journals):
         before = bench.before[k]
         after = before if journal.reason else recorded.gains[k]
-        corrections = _outcomes(journal.corrections, recorded, k)
         axes.append(
             AxisResult(
                 tuple(map(int, before)), tuple(map(int, after)), late_first(bench.target.drives, journal.reason),
-                tuple(journal.reservations), _with_outcomes(journal.notes, corrections),
+                tuple(journal.reservations), tuple(journal.notes),
                 identified.found[k], identified.plants[k],
                 float(recorded.cost[k]), float(recorded.proof[k]), recorded.verified[k], recorded.margins.get(k, {}),
                 recorded.at_least.get(k, {}), float(recorded.slack[k]), float(recorded.overshoot[k]),
-                corrections, bool(recorded.kept[k]),
+                tuple(journal.corrections), bool(recorded.kept[k]),
             )
         )  # fmt: skip
     ground, none = getattr(bench, "ground", None), np.zeros(bench.target.num_axes, np.int64)
@@ -129,29 +126,3 @@ def collect(bench: AutoBench, identified: IdentifiedAxes, recorded: RecordedGain
         tuple(axes), bench.spent, moves, aborts, violations, recorded.shown, recorded.earlier, recorded.response,
         recorded.loaded, bench.dynamics, file, kept,
     )  # fmt: skip
-
-
-def _with_outcomes(notes: Sequence[str], corrections: Sequence[Correction]) -> tuple[str, ...]:
-    """Return notes of an axis; of gains that were designed again and did not stay they say so."""
-    left, told = list(corrections), []
-    for note in notes:
-        one = next((one for one in left if note.endswith(f"measured: {one.reason}")), None)
-        if one is not None:
-            left.remove(one)
-        told.append(note if one is None or one.outcome == TAKEN else f"{note}; {one.outcome}")
-    return tuple(told)
-
-
-def _outcomes(corrections: Sequence[Correction], recorded: RecordedGains, k: int) -> tuple[Correction, ...]:
-    """Return corrections of an axis; of those whose new gains passed their trial and did not stay it says why."""
-    nexts = [*(one.old for one in corrections[1:]), tuple(map(int, recorded.gains[k]))]
-    told = []
-    for number, (one, then) in enumerate(zip(corrections, nexts, strict=False)):
-        if one.outcome == TAKEN and one.new != then:
-            last = number == len(corrections) - 1
-            why = (
-                "the gains before are kept" if last and recorded.kept[k] else "no better as measured: the old ones stay"
-            )
-            one = replace(one, outcome=why)
-        told.append(one)
-    return tuple(told)

@@ -67,7 +67,7 @@ def rules(
         before = file_of(drive, "rules")
         with unchanged(drive, before) as (target, _):
             with progress_bar("identifying") as show:
-                plants = identified_plants(target, show)
+                _, plants = identified_plants(target, lambda what, share: show(share))
             known = [plant for plant in plants if not isinstance(plant, str)]
             swung = swung_proposals(target, known) if relay and len(known) == len(plants) else [""] * len(plants)
             axes = [AxisRules(plant) for plant in plants]

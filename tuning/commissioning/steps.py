@@ -21,9 +21,9 @@ from drive_env.devices.gains import bandwidth_gains, cascade_columns, has_linear
 from drive_env.dictionary.roles import Role
 from drive_env.drives.raw_gains import read_gains
 from drive_env.loops.dynamics import Dynamics, find_dynamics
-from drive_env.loops.margins import Margins, margins
+from drive_env.loops.margins import Margins
 from drive_env.safety.envelope import swinging_allowed
-from tuning.auto.loop_margins import GAIN_ERROR, MS_ERROR, PHASE_ERROR
+from tuning.auto.loop_margins import asked_margins
 from tuning.auto.settings import ignore_unwired_switches, motor_parameters, told_unwired
 from tuning.commissioning.axis_limits import LIMITS, check_limits_of_motor, check_place_of_axes, limits_of, write_limits
 from tuning.commissioning.bench import CommissioningBench
@@ -210,11 +210,11 @@ def verify_loops(bench: CommissioningBench, say: Say) -> list[str]:
     measured = measure(target, "velocity", progress=lambda share: say("measuring the velocity loop", share))
     lines = []
     for k in range(target.num_axes):
-        loops = {"velocity": measured.margins(k)}
         if measured.fits[k] is not None:
-            both = measured.loops(measured.gains[k], k)
-            loops["position"] = margins(both.f, both.position, both.trusted)
-        elif not math.isfinite(loops["velocity"].ms):
+            loops = measured.loops(measured.gains[k], k).margins()
+        elif math.isfinite((velocity := measured.margins(k)).ms):
+            loops = {"velocity": velocity}
+        else:
             raise RuntimeError(f"{_axis(bench, k)}not measured: {'; '.join(measured.notes[k])}")
         for loop, one in loops.items():
             told = f"{_axis(bench, k)}{loop} loop {_figures(one)}"
@@ -287,14 +287,8 @@ def _figures(found: Margins) -> str:
 
 def _shortfall(found: Margins, asked: Dynamics) -> str:
     """Return which margins, as far as they were measured, are less than asked for, beyond what a measurement is off."""
-    short = []
-    if found.phase_deg < asked.phase_deg - PHASE_ERROR:
-        short.append(f"phase margin {asked.phase_deg:g}°")
-    if found.gain_db < asked.gain_db - GAIN_ERROR:
-        short.append(f"gain margin {asked.gain_db:g} dB")
-    if found.ms > asked.ms * MS_ERROR:
-        short.append(f"Ms {asked.ms:g}")
-    return ", ".join(short)
+    every = [one for one in asked_margins(asked) if one.missed(getattr(found, one.field), one.error)]
+    return ", ".join(f"{one.name} {one.limit:g} {one.unit}".rstrip() for one in every)
 
 
 # --- the table --------------------------------------------------------------------------------------------------------

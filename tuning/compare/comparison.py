@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from drive_env.drives.observed import ObservedDrives
+from drive_env.drives.raw_gains import read_gains
 from drive_env.loops.dynamics import DEFAULT
 from mechanics.arrays import Integers
 from mechanics.reading.untrusted import parse_json
@@ -29,11 +30,10 @@ from tuning.drive_audit import KINDS, DriveAudit
 from tuning.outcome import Outcome, Tuner
 from tuning.runs.inputs import as_given, taken_options
 from tuning.runs.shard_log import ShardLog
-from tuning.search.trial_bench import read_gains
 from tuning.target import Target
 
 if TYPE_CHECKING:
-    from tuning.identify.identified_axis import Identification
+    from drive_env.loops.linear_model import Plant
     from tuning.runs.pools import Pool
 
 Progress = Callable[[str, float], None]
@@ -267,7 +267,7 @@ class _Bench:
     def __init__(self, task: _Task, num_threads: int | None) -> None:
         self.task, self._num_threads = task, num_threads
         self._yardstick = Yardstick(task.group, num_threads, dynamics=task.dynamics)
-        self._identified: tuple[list[Identification], float, Integers, DriveAudit] | None = None
+        self._identified: tuple[list[Plant | str], float, Integers, DriveAudit] | None = None
 
     def close(self) -> None:
         """Give the yardstick's machines back."""
@@ -289,16 +289,15 @@ class _Bench:
                         outcome = tuner(watched, rng)
                     return outcome, _checked_gains(outcome, target), "", audit
                 except Exception as error:  # a tuner is anybody's code; the others are to be compared all the same
-                    return None, read_gains(target), as_given(f"{type(error).__name__}: {error}"), audit
+                    return None, read_gains(target.drives), as_given(f"{type(error).__name__}: {error}"), audit
 
     def _propose(self, tuner: RuleTuner, target: Target, audit: DriveAudit) -> tuple[Outcome, DriveAudit]:
         """Return a rule's gains, and the audit of the identification, which all rules share."""
         if self._identified is None:
-            before = read_gains(target)
-            found, seconds = identify_all(target)
-            self._identified = found, seconds, before, audit
-        found, seconds, before, audit = self._identified
-        return tuner.propose(target, found, before, seconds), audit
+            before = read_gains(target.drives)
+            self._identified = *identify_all(target), before, audit
+        plants, seconds, before, audit = self._identified
+        return tuner.propose(target, plants, before, seconds), audit
 
     def rows(self, name: str, tuner: Tuner) -> list[MachineRow]:
         """Tune every machine with a tuner."""

@@ -27,14 +27,8 @@ def save(comparison: Comparison, folder: Path, settings: Mapping[str, Any]) -> N
 
 def settings_text(settings: Mapping[str, Any]) -> str:
     """Return settings as TOML, with the hashes of the inputs among them; what is None is left out."""
-    lines = [f"{name} = {_toml(as_kept(value))}" for name, value in settings.items() if value is not None]
+    lines = [f"{name} = {toml(as_kept(value))}" for name, value in settings.items() if value is not None]
     return "\n".join([*lines, *table_of(inputs_in(settings))]) + "\n"
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    return f"[{', '.join(map(toml, value))}]" if isinstance(value, list | tuple) else toml(value)
 
 
 def _write_csv(path: Path, rows: Sequence[Any], kind: type) -> None:

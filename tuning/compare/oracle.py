@@ -30,7 +30,7 @@ from mechanics.arrays import Floats, Integers, Mask
 from mechanics.reading.untrusted import read_rows
 from tuning.auto.design import CURRENT_CROSSOVER, CURRENT_LAG, LEAST_TORQUE
 from tuning.compare.suite import SuiteMachine, groups
-from tuning.compare.yardstick import Yardstick
+from tuning.compare.yardstick import REPEATS, Yardstick
 
 KEPT = Path(__file__).with_name("oracles.csv")
 HEAD = ("device", "machine", "digest", "gains", "performance", "slack")
@@ -103,11 +103,15 @@ def search_oracle(
 ) -> Oracle:
     """Return the oracle of a machine; the seed draws what is tried."""
     rng = np.random.default_rng(seed)
-    with closing(Yardstick([machine], num_threads, REPEATED, POPULATION, dynamics)) as yardstick:
-        last = _evolved(yardstick, _Box.of(yardstick), rng)
-    with closing(Yardstick([machine], num_threads, copies=FINALISTS, dynamics=dynamics)) as yardstick:
-        scores = yardstick.score(last[:FINALISTS].reshape(-1, last.shape[-1]))
-    best = int(scores.robust_cost.argmin())
+    # Gains that rest in a few places may hunt in others: where all do, every run counts in the search, too.
+    for repeats in (REPEATED, REPEATS):
+        with closing(Yardstick([machine], num_threads, repeats, POPULATION, dynamics)) as yardstick:
+            last = _evolved(yardstick, _Box.of(yardstick), rng)
+        with closing(Yardstick([machine], num_threads, copies=FINALISTS, dynamics=dynamics)) as yardstick:
+            scores = yardstick.score(last[:FINALISTS].reshape(-1, last.shape[-1]))
+        best = int(scores.robust_cost.argmin())
+        if scores.slack[best] > 0.0:
+            break
     return Oracle(last[best], float(scores.performance[best]), float(scores.slack[best]))
 
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drive_env.drives.raw_gains import write_gains
+from drive_env.drives.raw_gains import read_gains, write_gains
 from drive_env.loops.linear_model import OPEN_LOOPS, Plant
 from drive_env.loops.margins import margins
 from drive_env.safety.envelope import swinging_allowed
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from drive_env.devices import Device
     from drive_env.loops.dynamics import Dynamics
     from drive_env.loops.margins import Margins
+    from tuning.identify.identified_axis import Identification, Progress
     from tuning.rules.proposal import Proposal
     from tuning.target import Target
 
@@ -36,12 +37,12 @@ class AxisRules:
     unswung: str = ""
 
 
-def identified_plants(target: Target, progress: Callable[[float], None]) -> list[Plant | str]:
-    """Return the axes' models, or the reason for an axis without one: the inertia was not identified."""
+def identified_plants(target: Target, progress: Progress) -> tuple[list[Identification], list[Plant | str]]:
+    """Identify axes; return their models, too, or the reason for an axis without one: no inertia was identified."""
     from tuning.identify.identification import identify
 
     with swinging_allowed(target.drives):
-        found = identify(target, progress=lambda what, share: progress(share))
+        found = identify(target, progress=progress)
     plants: list[Plant | str] = []
     for axis, one in enumerate(found):
         try:
@@ -49,7 +50,7 @@ def identified_plants(target: Target, progress: Callable[[float], None]) -> list
             plants.append(Plant.from_identification(target.device, target.motor, supply, one))
         except ValueError as error:
             plants.append(str(error))
-    return plants
+    return found, plants
 
 
 def proposals(target: Target, plant: Plant, names: Sequence[str]) -> dict[str, Proposal]:
@@ -60,9 +61,8 @@ def proposals(target: Target, plant: Plant, names: Sequence[str]) -> dict[str, P
 def swung_proposals(target: Target, plants: Sequence[Plant]) -> list[Proposal | str]:
     """Return the relay experiments' proposals, with the rule's current loops, or the reason for a missing one."""
     from tuning.rules.relay import gains_from_swing, relay_experiment, relay_rule
-    from tuning.search.trial_bench import read_gains
 
-    before = read_gains(target)
+    before = read_gains(target.drives)
     gains = [relay_rule(target.device, target.motor, plant).gains for plant in plants]
     write_gains(target.drives, np.array(gains, np.int64))
     try:

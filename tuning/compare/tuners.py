@@ -14,18 +14,18 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from drive_env.drives.raw_gains import write_gains
+from drive_env.drives.raw_gains import read_gains, write_gains
 from drive_env.loops.dynamics import DEFAULT
 from mechanics.arrays import Integers
 from tuning.outcome import Outcome, Tuner
 from tuning.search.optimise import Settings, optimise
 from tuning.search.samplers import check_installed
-from tuning.search.trial_bench import TrialBench, read_gains
+from tuning.search.trial_bench import TrialBench
 from tuning.target import Target, timed
 
 if TYPE_CHECKING:
     from drive_env.loops.dynamics import Dynamics
-    from tuning.identify.identified_axis import Identification
+    from drive_env.loops.linear_model import Plant
     from tuning.rules.proposal import Proposal
 
 ENTRY_POINTS = "drive_env.tuners"
@@ -88,7 +88,7 @@ def find_tuner(name: str, trials: int | None = None, dynamics: str | Dynamics = 
 # --- tuners without a search ------------------------------------------------------------------------------------------
 def _factory(target: Target, rng: np.random.Generator) -> Outcome:
     """Leave the gains that the drive was commissioned with."""
-    return _outcome(target, read_gains(target))
+    return _outcome(target, read_gains(target.drives))
 
 
 def _baseline(target: Target, rng: np.random.Generator) -> Outcome:
@@ -97,7 +97,7 @@ def _baseline(target: Target, rng: np.random.Generator) -> Outcome:
         bench = TrialBench(watched)
         bench.identify()
         bench.leave(bench.rule)
-    return _outcome(target, bench.rule, clock.seconds, bench.moves)
+    return _outcome(target, bench.rule, clock.seconds, moves=bench.moves)
 
 
 class RuleTuner:
@@ -112,38 +112,32 @@ class RuleTuner:
 
     def __call__(self, target: Target, rng: np.random.Generator) -> Outcome:
         """Tune a target."""
-        before = read_gains(target)
-        found, seconds = identify_all(target)
-        outcome = self.propose(target, found, before, seconds)
+        before = read_gains(target.drives)
+        plants, seconds = identify_all(target)
+        outcome = self.propose(target, plants, before, seconds)
         write_gains(target.drives, outcome.gains)
         return outcome
 
-    def propose(
-        self, target: Target, found: Sequence[Identification], before: Integers, seconds: float = 0.0
-    ) -> Outcome:
-        """Return the gains for what was identified; an axis without a proposal keeps those before, and says why."""
-        from drive_env.loops.linear_model import Plant
-
+    def propose(self, target: Target, plants: Sequence[Plant | str], before: Integers, seconds: float = 0.0) -> Outcome:
+        """Return the gains for axes' models; an axis without one keeps those before, and has the reason as its note."""
         gains, notes = before.copy(), []
-        for axis, identified in enumerate(found):
-            try:
-                plant = Plant.from_identification(target.device, target.motor, float(target.supply[axis]), identified)
-                proposal = self._rule(target.device, target.motor, plant)
-            except ValueError as error:  # what the rule needs was not identified
-                notes.append(f"no proposal: {error}")
+        for axis, plant in enumerate(plants):
+            if isinstance(plant, str):
+                notes.append(f"no proposal: {plant}")
                 continue
+            proposal = self._rule(target.device, target.motor, plant)
             gains[axis] = proposal.gains
             notes.append("; ".join(proposal.notes))
         return _outcome(target, gains, seconds, notes=tuple(notes))
 
 
-def identify_all(target: Target) -> tuple[list[Identification], float]:
-    """Identify a target; return the result and the drive time that it took [s]."""
-    from tuning.identify.identification import identify
+def identify_all(target: Target) -> tuple[list[Plant | str], float]:
+    """Identify a target; return models of its axes, as `identified_plants` does, and the drive time [s]."""
+    from tuning.compare.side_by_side import identified_plants
 
     with timed(target) as (watched, clock):
-        found = identify(watched)
-    return found, clock.seconds
+        _, plants = identified_plants(watched, lambda what, share: None)
+    return plants, clock.seconds
 
 
 def _rules() -> Mapping[str, Callable[..., Proposal]]:
@@ -162,7 +156,7 @@ def search_tuner(target: Target, rng: np.random.Generator, **settings: Any) -> O
     """Search gains by trials; `settings` are those of `optimise.Settings`."""
     found = optimise(target, Settings(seed=int(rng.integers(2**31)), **settings))
     notes = tuple(note for note in found.notes for _ in range(target.axes_per_machine))
-    return _outcome(target, found.gains, found.drive_seconds, found.moves, found.aborts, notes)
+    return _outcome(target, found.gains, found.drive_seconds, moves=found.moves, aborts=found.aborts, notes=notes)
 
 
 def _search(sampler: str, trials: int, safe: bool = False) -> Tuner:
@@ -204,21 +198,8 @@ _AFTER = (
 )  # fmt: skip
 
 
-def _outcome(
-    target: Target,
-    gains: Integers,
-    seconds: float = 0.0,
-    moves: Integers | None = None,
-    aborts: Integers | None = None,
-    notes: tuple[str, ...] | None = None,
-) -> Outcome:
+def _outcome(target: Target, gains: Integers, seconds: float = 0.0, **counted: Any) -> Outcome:
+    """Return gains and drive time as an outcome, and what was counted; of all else nothing."""
     count = target.num_axes
-    zero = np.zeros(count, np.int64)
-    return Outcome(
-        gains,
-        np.full(count, seconds),
-        zero if moves is None else moves,
-        zero if aborts is None else aborts,
-        zero,
-        ("",) * count if notes is None else notes,
-    )
+    rest = dict.fromkeys(("moves", "aborts", "violations"), np.zeros(count, np.int64)) | {"notes": ("",) * count}
+    return Outcome(gains, np.full(count, seconds), **(rest | counted))

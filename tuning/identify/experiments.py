@@ -20,7 +20,7 @@ from mechanics.arrays import Floats, Integers, Mask
 from tuning.estimate import Estimate, refused
 from tuning.identify.encoder_check import PULSED, EncoderCheck, check_encoders
 from tuning.identify.identified_axis import NAMES, Identification, Progress
-from tuning.identify.inertia import Mechanics, identify_mechanics
+from tuning.identify.inertia import identify_mechanics
 from tuning.identify.standstill import standstill_resistances
 from tuning.identify.winding import Winding, identify_winding, pulse, to_torque_mode
 from tuning.identify.wiring import Settings, changes, finding, findings, needed, write_wiring
@@ -217,7 +217,8 @@ class Experiments:
         drives = working.target.drives
         self.begin("inertia and friction", 0.3, MECHANICS)
         mechanics, inertia = identify_mechanics(working, holding)
-        self._take_mechanics(working, mechanics)
+        for k in np.flatnonzero(working.where):
+            self.found[k] |= mechanics[k]._asdict()
         working = self.calm(working)
         self.begin("resonance, delay, filter", 0.7, RESPONSE)
         self.respond(working, inertia)
@@ -268,10 +269,6 @@ class Experiments:
                 default=both[-1] if _in_real_time(working) else both[0],
             )  # fmt: skip
             self.found[k] |= {"resistance": resistance, "inductance": windings[k].inductance}
-
-    def _take_mechanics(self, working: Working, mechanics: list[Mechanics]) -> None:
-        for k in np.flatnonzero(working.where):
-            self.found[k] |= mechanics[k]._asdict()
 
     def respond(self, working: Working, inertia: Floats) -> None:
         """Measure the velocity loop's response, with loops fit for it, and take its estimates."""
@@ -334,12 +331,9 @@ class Experiments:
             )
         return np.array(rows, np.int64)
 
-    def _late_first(self, reason: str) -> str:
-        return late_first(self._drives, reason)
-
     def refuse(self, k: int, names: tuple[str, ...], reason: str) -> None:
         """Refuse values that are still missing, by a reason or by late SYNCs."""
-        reason = self._late_first(reason)
+        reason = late_first(self._drives, reason)
         for name in names:
             if not self.found[k][name].is_known and self.found[k][name].reason in ("", "not asked for"):
                 self.found[k][name] = refused(UNITS[name], reason)

@@ -67,9 +67,7 @@ NO_DELAY = (
 )
 
 
-def identify_briefly(
-    target: Target, where: Mask | None = None, progress: Progress | None = None
-) -> list[Identification]:
+def identify_briefly(target: Target, where: Mask | None = None) -> list[Identification]:
     """Identify axes, all by default, in about four seconds for each of a machine.
 
     Otherwise as `identify`; those of one machine move one after the other, or all if linked.
@@ -79,7 +77,7 @@ def identify_briefly(
         guesses, for twins.
     """
     axes = np.ones(target.num_axes, bool) if where is None else where
-    return _Brief(target, axes, progress or (lambda what, share: None)).run()
+    return _Brief(target, axes, lambda what, share: None).run()
 
 
 class _Brief(Experiments):

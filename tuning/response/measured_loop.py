@@ -41,7 +41,7 @@ class Loops(NamedTuple):
     def margins(self) -> dict[str, margins_.Margins]:
         """Return the margins of both by name, by their trusted lines; nan for those that they do not show."""
         both = {"velocity": self.velocity, "position": self.position}
-        return {name: _seen(margins_.margins(self.f, L, self.trusted)) for name, L in both.items()}
+        return {name: seen_margins(self.f, L, self.trusted) for name, L in both.items()}
 
 
 class AtLeast(NamedTuple):
@@ -94,7 +94,7 @@ class MeasuredLoop:
 
     def margins(self, axis: int = 0) -> margins_.Margins:
         """Return the margins of an axis, by its trusted lines; nan for those that they do not show."""
-        return _seen(margins_.margins(*self.refined(axis)))
+        return seen_margins(*self.refined(axis))
 
     def refined(self, axis: int = 0) -> tuple[Floats, Complex, Mask]:
         """Return frequencies, open loop, and which of them are trusted, between the lines too.
@@ -215,11 +215,12 @@ class MeasuredLoop:
         return fit.estimates
 
 
-def _seen(found: margins_.Margins) -> margins_.Margins:
-    """Return margins without a gain margin that was not seen.
+def seen_margins(f: Floats, open_loop: Complex, trusted: Mask) -> margins_.Margins:
+    """Return margins of a loop by its trusted lines, arrays (n,), without a gain margin that was not measured.
 
     A phase of -180 degrees that was not reached may lie above the frequencies looked at.
     """
+    found = margins_.margins(f, open_loop, trusted)
     return found if math.isfinite(found.gain_db) else found._replace(gain_db=math.nan)
 
 

@@ -30,10 +30,9 @@ if TYPE_CHECKING:
 
 
 TIME, TRANSIENT = 0.3, 0.1  # of the experiment, and of it what is left out at its beginning [s]
-SHARE = 0.4  # of the rated current, at least: the relay's height
+SHARE = 0.4  # of the rated current: the relay's height
 # Of the drive's current limit, at most: an envelope takes half of it, swung through, for a shaking loop.
 OF_LIMIT = 0.45
-OVER_FRICTION = 2.0  # the relay's height over the dry friction, where the limits allow
 TRAVEL_SHARE = 0.8  # of the way that there is: beyond it the relay is off
 OFF = 1.5  # factor by which the inertia of the swing may be another than the axis's
 LEAST_COUNTS = 0.5  # of the encoder: the amplitude of a swing that is more than noise
@@ -121,33 +120,24 @@ def finish(bench: Workbench, ultimate: Ultimate, slope: float) -> Proposal:
     return bench.proposal()
 
 
-def relay_experiment(target: Target, where: Mask | None = None, coulomb: Floats | None = None) -> Swing:
+def relay_experiment(target: Target) -> Swing:
     """Swing axes by a relay and evaluate the swing; the drives are enabled in cst meanwhile and off afterwards.
 
     The current loop must work: write its gains first. An axis that nears the end of its travel is left alone.
-
-    Args:
-        target: The drives.
-        where: Axes that take part; all by default.
-        coulomb: Dry friction [A], shape (num_axes,), which takes its share of the relay's height; 0 by default.
     """
     drives, n = target.drives, target.num_axes
-    axes = np.ones(n, bool) if where is None else where
-    dry = np.zeros(n) if coulomb is None else np.nan_to_num(np.asarray(coulomb, float))
-    limit = OF_LIMIT * read_current_limit(drives)
-    height = np.minimum(
-        np.maximum(SHARE * target.motor.rated_current, OVER_FRICTION * dry), np.minimum(limit, target.current)
-    )
+    limit = np.minimum(OF_LIMIT * read_current_limit(drives), target.current)
+    height = np.minimum(SHARE * target.motor.rated_current, limit)
     scale, counts, origin = target.increments(), target.speed_counts(), drives.read(cia402.POSITION_ACTUAL)
     low, high = TRAVEL_SHARE * target.low * scale, TRAVEL_SHARE * target.high * scale
-    drives.write(cia402.TARGET_TORQUE, 0, where=axes)
-    motion.enable(drives, mode="cst", where=axes)
+    drives.write(cia402.TARGET_TORQUE, 0)
+    motion.enable(drives, mode="cst")
     cycles = round(TIME / CYCLE)
     per_count = ampere_per_count(drives)
     speed, current = np.zeros((cycles, n)), np.zeros((cycles, n))
-    inside = axes.copy()
+    inside = np.ones(n, bool)
     bias = np.zeros(n)
-    torque = np.where(inside, height, 0.0)
+    torque = np.broadcast_to(height, n)
     try:
         for k in range(cycles):
             played = {cia402.TARGET_TORQUE: to_counts(drives, torque)[None]}
@@ -164,20 +154,18 @@ def relay_experiment(target: Target, where: Mask | None = None, coulomb: Floats 
             torque = np.where(inside, bias - height * np.sign(speed[k] + (speed[k] == 0.0)), 0.0)
         drives.record([cia402.VELOCITY_ACTUAL], 5 * CYCLE, play={cia402.TARGET_TORQUE: np.zeros((5, n), np.int64)})
     finally:
-        motion.disable(drives, where=axes)
+        motion.disable(drives)
     count = 2.0 * math.pi / target.motor.encoder_counts
-    return evaluate(speed, current, dry, axes, inside, count)
+    return evaluate(speed, current, inside, count)
 
 
-def evaluate(speed: Floats, current: Floats, coulomb: Floats, axes: Mask, inside: Mask, count_angle: float) -> Swing:
+def evaluate(speed: Floats, current: Floats, inside: Mask, count_angle: float) -> Swing:
     """Evaluate recorded swings.
 
     Args:
         speed: Velocity once a cycle [rad/s], shape (n, num_axes).
         current: Actual current, likewise [A].
-        coulomb: Dry friction [A], shape (num_axes,).
-        axes: Which axes took part.
-        inside: Which of them kept away from the ends of their travel.
+        inside: Which axes kept away from the ends of their travel, shape (num_axes,).
         count_angle: What a count of the encoder is [rad].
     """
     count = speed.shape[1]
@@ -185,9 +173,6 @@ def evaluate(speed: Floats, current: Floats, coulomb: Floats, axes: Mask, inside
     reasons = [""] * count
     first = round(TRANSIENT / CYCLE)
     for axis in range(count):
-        if not axes[axis]:
-            reasons[axis] = "not asked for"
-            continue
         if not inside[axis]:
             reasons[axis] = "the travel is too short: the relay drove the axis to its end"
             continue
@@ -206,8 +191,6 @@ def evaluate(speed: Floats, current: Floats, coulomb: Floats, axes: Mask, inside
                 f"the axis swung by less than {LEAST_COUNTS:g} counts: friction is too high, or the inertia too large"
             )
             continue
-        # Dry friction brakes with the velocity's sign: a square wave in its phase.
-        amps -= 4.0 / math.pi * coulomb[axis] * V / abs(V)
         G = V / amps
         phase = np.angle(G * 1j)  # beyond the 90 degrees of the integrator
         result["frequency"][axis], result["amplitude"][axis] = found, abs(V)

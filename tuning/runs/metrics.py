@@ -141,25 +141,19 @@ def tracking(found: Figures, weights: Mapping[str, float]) -> Floats:
     same times over the height: by how many seconds the axis is behind. A PID of a stepper measures no torque current:
     its third term is vibration * the RMS change of demand - encoder per sample [full steps].
     """
-    height = abs(float(found.recording.reference_rpm[-1]))
-    if found.recording.full_steps is not None:
-        behind = weights["step"] * _behind(found, slice(None, len(found.step_error))) + weights[
-            "disturbance"
-        ] * _behind(found, slice(len(found.step_error) - 1, None))
-        if found.recording.measures_current:
-            return behind + weights["ripple"] * ripple(found) / found.recording.current_limit
-        return behind + weights["vibration"] * _vibration(found)
-    if found.recording.effort is not None:
-        return (
-            weights["step"] * _iae(found) / height
-            + weights["disturbance"] * _disturbance_iae(found) / height
-            + weights["effort"] * found.recording.effort
-        )
-    return (
-        weights["step"] * _iae(found) / height
-        + weights["disturbance"] * _disturbance_iae(found) / height
-        + weights["ripple"] * ripple(found) / found.recording.current_limit
-    )
+    recording, load = found.recording, len(found.step_error) - 1
+    height = abs(float(recording.reference_rpm[-1]))
+    if recording.full_steps is not None:
+        step, disturbance = _behind(found, slice(load + 1)), _behind(found, slice(load, None))
+    else:
+        step, disturbance = _iae(found) / height, _disturbance_iae(found) / height
+    if recording.effort is not None:
+        third = weights["effort"] * recording.effort
+    elif recording.measures_current:
+        third = weights["ripple"] * ripple(found) / recording.current_limit
+    else:
+        third = weights["vibration"] * _vibration(found)
+    return weights["step"] * step + weights["disturbance"] * disturbance + third
 
 
 def score(name: str, weights: Mapping[str, float], found: Figures) -> Floats:

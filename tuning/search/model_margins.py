@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from drive_env import cia402
 from drive_env.drives.interface import axis_number
 from drive_env.drives.raw_gains import read_gains
 from drive_env.loops.linear_model import Plant
 from drive_env.safety.envelope import swinging_allowed
-from drive_env.trials.positioning import wrapped
 from mechanics.arrays import Floats, Integers, Mask
-from tuning.auto.checks import identified_plant
+from tuning.auto.identified import identified_plant
 from tuning.auto.loop_model import loop_models
 from tuning.auto.stages import IdentifiedAxes
 from tuning.identify.quick_identification import identify_briefly
@@ -78,14 +75,3 @@ class ModelMargins:
             for k, loops in zip(own, model.margins(gains[own]), strict=True):
                 found[k] = [(one.phase_deg, one.gain_db, one.ms) for one in loops.values()]
         return found
-
-
-def here(target: Target, began: Integers) -> Target:
-    """Return the target with the travel that is left where the rotors are now.
-
-    Args:
-        target: Its travel counts from where the rotors began.
-        began: Where that was [inc], (num_axes,).
-    """
-    gone = wrapped(target.drives.read(cia402.POSITION_ACTUAL) - began) / target.increments()
-    return replace(target, low=np.minimum(target.low - gone, 0.0), high=np.maximum(target.high - gone, 0.0))

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,7 +28,7 @@ from drive_env.trials.positioning import wrapped
 from drive_env.trials.score import TRIP, robust_cost
 from mechanics.arrays import Floats, Integers
 from tuning.runs.shard_log import ShardLog
-from tuning.search.model_margins import ModelMargins, here
+from tuning.search.model_margins import ModelMargins
 from tuning.search.samplers import SAMPLERS, Proposer, Study, load, new_proposer
 from tuning.search.trial_bench import OBJECTIVES, TrialBench, Tried
 from tuning.search.trial_log import LoggedTrials
@@ -202,7 +202,9 @@ def optimise(
             # Copies of one machine are known by the first one.
             where = np.arange(target.num_axes) < (target.axes_per_machine if shared else target.num_axes)
             known = ModelMargins(watched, find_dynamics(settings.dynamics, settings.inertia_range), where)
-            watched = watched if anew else here(watched, began)
+            if not anew:
+                low, high = watched.travel_left(began)
+                watched = replace(watched, low=low, high=high)
         bench = TrialBench(watched, anew=anew, gains=chosen)
         load(settings.sampler)
         bench.identify()

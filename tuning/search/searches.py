@@ -24,6 +24,9 @@ from tuning.search.optimise import SAFE_STARTS, Optimised, Settings, TrialRow, o
 from tuning.target import emulated
 from tuning.toml_tables import toml
 
+# Fields of `Optimised` of which a search on copies of one machine has those of one, of all its axes; and of all copies.
+OF_AXES, OF_ALL, SUMS = ("gains", "rule", "margins"), ("moves", "aborts"), ("drive_seconds", "untried")
+
 
 class Search(NamedTuple):
     """A search on an emulated machine: the arguments of `emulated`, and the settings."""
@@ -58,9 +61,9 @@ def description(shards: list[Search]) -> str:
     """Return the machine and the settings of searches as TOML lines; equal searches have equal lines."""
     lines = [f"searches = {len(shards)}"]
     machine = as_kept(dict(shards[0].machine))
-    lines += [f"machine.{name} = {_text(value)}" for name, value in machine.items() if value is not None]
+    lines += [f"machine.{name} = {toml(value)}" for name, value in machine.items() if value is not None]
     settings = {f.name: getattr(shards[0].settings, f.name) for f in fields(Settings) if f.name != "subject"}
-    lines += [f"{name} = {_text(value)}" for name, value in settings.items() if value is not None]
+    lines += [f"{name} = {toml(value)}" for name, value in settings.items() if value is not None]
     return "\n".join(lines) + "\n"
 
 
@@ -110,19 +113,13 @@ def _done(
 
 def joined(found: list[Optimised]) -> Optimised:
     """Return searches as one: gains (searches * axes, count) and cost (searches,) of each, counts of all machines."""
-    return Optimised(
-        np.concatenate([one.gains for one in found]),
-        np.concatenate([one.rule for one in found]),
-        np.concatenate([one.cost for one in found]),
-        tuple(row for one in found for row in one.rows),
-        sum(one.drive_seconds for one in found),
-        np.concatenate([one.moves for one in found]),
-        np.concatenate([one.aborts for one in found]),
-        tuple(note for one in found for note in one.notes),
-        found[0].t_0,
-        sum(one.untried for one in found),
-        np.concatenate([one.margins for one in found]),
-    )
+    rows = tuple(row for one in found for row in one.rows)
+    notes = tuple(note for one in found for note in one.notes)
+    every: dict[str, Any] = {
+        name: np.concatenate([getattr(one, name) for one in found]) for name in (*OF_AXES, "cost", *OF_ALL)
+    }
+    total = {name: sum(getattr(one, name) for one in found) for name in SUMS}
+    return replace(found[0], rows=rows, notes=notes, **every, **total)
 
 
 def _run(task: _SearchTask, progress: Callable[[float], None] = lambda share: None) -> Arrays:
@@ -132,27 +129,12 @@ def _run(task: _SearchTask, progress: Callable[[float], None] = lambda share: No
     with emulated(**search.machine) as target, kept as log:
         found = optimise(target, search.settings, shared=True, anew=True, log=log, progress=progress)
         axes = target.axes_per_machine
-    rows = found.rows
+    rows = {f"trial {name}": np.array([getattr(row, name) for row in found.rows]) for name in TrialRow._fields}
     return {
-        "gains": found.gains[:axes],
-        "rule": found.rule[:axes],
-        "cost": found.cost[:1],
-        "number": np.array([row.number for row in rows], np.int64),
-        "tried": np.array([row.gains for row in rows], np.int64).reshape(len(rows), axes, found.gains.shape[1]),
-        "costs": np.array([row.cost for row in rows], float),
-        "objectives": np.array([row.objectives for row in rows], float).reshape(len(rows), -1),
-        "aborted": np.array([row.aborted for row in rows], bool),
-        "fragile": np.array([row.fragile for row in rows], bool),
-        "cause": np.array([row.cause for row in rows], np.str_),
-        "slack": np.array([row.slack for row in rows], float),
-        "drive_seconds": np.array(found.drive_seconds),
-        "moves": found.moves,
-        "aborts": found.aborts,
-        "notes": np.array(found.notes[:1]),
-        "t_0": np.array(found.t_0),
-        "untried": np.array(found.untried),
-        "margins": found.margins[:axes],
-    }
+        "cost": found.cost[:1], "notes": np.array(found.notes[:1]), **rows,
+        **{name: getattr(found, name)[:axes] for name in OF_AXES},
+        **{name: np.array(getattr(found, name)) for name in (*OF_ALL, *SUMS, "t_0")},
+    }  # fmt: skip
 
 
 def _is_of(task: _SearchTask, arrays: Any) -> bool:
@@ -163,44 +145,11 @@ def _is_of(task: _SearchTask, arrays: Any) -> bool:
 
 
 def _optimised(arrays: Mapping[str, NDArray[Any]], search: int) -> Optimised:
-    rows = tuple(
-        TrialRow(
-            search,
-            int(number),
-            gains,
-            float(cost),
-            tuple(objectives.tolist()),
-            bool(aborted),
-            bool(fragile),
-            str(cause),
-            float(slack),
-        )
-        for number, gains, cost, objectives, aborted, fragile, cause, slack in zip(
-            *(
-                arrays[name]
-                for name in ("number", "tried", "costs", "objectives", "aborted", "fragile", "cause", "slack")
-            ),
-            strict=True,
-        )
-    )
-    return Optimised(
-        arrays["gains"],
-        arrays["rule"],
-        arrays["cost"],
-        rows,
-        float(arrays["drive_seconds"]),
-        arrays["moves"],
-        arrays["aborts"],
-        tuple(map(str, arrays["notes"])),
-        float(arrays["t_0"]),
-        int(arrays["untried"]),
-        arrays["margins"],
-    )
-
-
-def _text(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, tuple | list):
-        return f"[{', '.join(map(_text, value))}]"
-    return toml(value if isinstance(value, str | int | float) else str(value))
+    columns = [arrays[f"trial {name}"] for name in TrialRow._fields]
+    # Gains stay an array, all else is plain.
+    plain = (column if column.ndim == 3 else column.tolist() for column in columns)
+    rows = (TrialRow(*values)._replace(search=search) for values in zip(*plain, strict=True))
+    rest: dict[str, Any] = {name: arrays[name] for name in (*OF_AXES, "cost", *OF_ALL)}
+    rest |= {name: arrays[name].item() for name in (*SUMS, "t_0")}
+    listed = tuple(row._replace(objectives=tuple(row.objectives)) for row in rows)
+    return Optimised(rows=listed, notes=tuple(map(str, arrays["notes"])), **rest)

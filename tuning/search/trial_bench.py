@@ -19,7 +19,7 @@ from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count
 from drive_env.drives.interface import Drives, axis_number, machine_of
 from drive_env.drives.observed import ObservedDrives
-from drive_env.drives.raw_gains import write_gains
+from drive_env.drives.raw_gains import read_gains, write_gains
 from drive_env.safety.envelope import SafetyError
 from drive_env.trials.gain_trial import Identified, Trial, measured_cost
 from drive_env.trials.method import method_of
@@ -132,7 +132,7 @@ class TrialBench:
         target, drives = self.target, self.target.drives
         if self._anew:
             machine_of(drives).reset()
-        present = read_gains(target)
+        present = read_gains(drives)
         gains = self.method.keep(self.method.first(target.supply), present)
         write_gains(drives, gains)  # before anything is enabled: the drives may have any
         check_motors(target.drives)
@@ -325,8 +325,3 @@ class TrialBench:
 def first_gains(target: Target) -> Integers:
     """Return gains from the data sheet alone, shape (num_axes, count)."""
     return method_of(target.device, target.motor).first(target.supply)
-
-
-def read_gains(target: Target) -> Integers:
-    """Return the gains that the drives have, shape (num_axes, count)."""
-    return target.device.gains.read(target.drives)

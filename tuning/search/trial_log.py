@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from drive_env.drives.raw_gains import write_gains
+from drive_env.drives.raw_gains import read_gains, write_gains
 from mechanics.arrays import Integers, Mask
 from tuning.runs.shard_log import ShardLog, ShardLogError
-from tuning.search.trial_bench import TrialBench, Tried, read_gains
+from tuning.search.trial_bench import TrialBench, Tried
 from tuning.target import DriveTime
 
 
@@ -40,7 +40,7 @@ class LoggedTrials:
             tried = bench.run(gains, where)
             self._log.append(number, {
                 "tried": gains, "where": where, **tried._asdict(), "moves": bench.moves, "aborts": bench.aborts,
-                "seconds": np.array(self._clock.seconds), "left": read_gains(bench.target),
+                "seconds": np.array(self._clock.seconds), "left": read_gains(drives),
             })  # fmt: skip
             return tried
         known = self._log.done[number]

@@ -71,20 +71,9 @@ def save(
     table = io.StringIO()
     writer = csv.writer(table)
     told = titles(machine["device"], settings.gains)
-    names, gains_there_are = (COST, *OBJECTIVES), find_device(machine["device"]).gains.names
-    writer.writerow(
-        [
-            "search",
-            "trial",
-            "axis",
-            *gains_there_are,
-            *(told[name] for name in names),
-            "stopped",
-            "fragile",
-            "cause",
-            "slack",
-        ]
-    )
+    names, known = (COST, *OBJECTIVES), find_device(machine["device"]).gains.names
+    figures_told = (told[name] for name in names)
+    writer.writerow(["search", "trial", "axis", *known, *figures_told, "stopped", "fragile", "cause", "slack"])
     for row in found.rows:
         values = [f"{value:.6g}" for value in figures(row, names, found.t_0)]
         for axis, gains in zip(axis_numbers(machine, len(row.gains)), row.gains.tolist(), strict=True):
@@ -169,13 +158,7 @@ def axis_numbers(machine: Mapping[str, Any], count: int) -> list[int]:
 
 
 def _lines(values: Mapping[str, Any]) -> list[str]:
-    return [f"{name} = {_text(value)}" for name, value in values.items() if value is not None]
-
-
-def _text(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    return f"[{', '.join(map(toml, value))}]" if isinstance(value, tuple | list) else toml(value)
+    return [f"{name} = {toml(value)}" for name, value in values.items() if value is not None]
 
 
 def trials_figure(found: Optimised, settings: Settings, device: str) -> Figure:

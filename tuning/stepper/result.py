@@ -114,9 +114,9 @@ class StepperResult:
         }
 
 
-def figure(value: float, digits: int = 5) -> float | None:
+def figure(value: float) -> float | None:
     """Return a number as the certificate has it: None for one that was not measured."""
-    return float(f"{value:.{digits}g}") if math.isfinite(value) else None
+    return float(f"{value:.5g}") if math.isfinite(value) else None
 
 
 @contextmanager

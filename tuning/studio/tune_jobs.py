@@ -102,9 +102,7 @@ def restore_before(desk: TuneDesk) -> Callable[[Drives], int]:
         before = desk.before
         if before is None:
             raise ValueError("this page has changed nothing yet")
-        for axis in range(drives.num_axes):
-            if cia402.is_live(int(drives.read(cia402.STATUSWORD)[axis])):
-                disable(axis)(drives)
+        rest(drives)
         old = read_gains(drives)
         try:
             changed = restore(drives, before, whole=False)
@@ -308,23 +306,16 @@ def identify_axes(desk: TuneDesk) -> Callable[[Drives], None]:
     """Return the job that identifies every axis, and has the rules propose gains for each."""
 
     def job(drives: Drives) -> None:
-        from drive_env.loops.linear_model import Plant
-        from drive_env.safety.envelope import swinging_allowed
-        from tuning.compare.side_by_side import AxisRules, proposals
-        from tuning.identify.identification import identify
+        from tuning.compare.side_by_side import AxisRules, identified_plants, proposals
         from tuning.rules.rules_by_name import RULES
 
         rest(drives)
-        with desk.target(drives) as target, swinging_allowed(drives):
-            found = identify(target, progress=lambda what, share: progress_of(desk, what)(share))
-            rules = []
-            for axis, one in enumerate(found):
-                try:
-                    supply = float(target.supply[axis])
-                    plant = Plant.from_identification(target.device, target.motor, supply, one)
-                    rules.append(AxisRules(plant, proposals(target, plant, list(RULES))))
-                except ValueError as error:
-                    rules.append(AxisRules(str(error)))
+        with desk.target(drives) as target:
+            found, plants = identified_plants(target, lambda what, share: progress_of(desk, what)(share))
+            rules = [
+                AxisRules(plant, {} if isinstance(plant, str) else proposals(target, plant, list(RULES)))
+                for plant in plants
+            ]
         desk.identified, desk.rules = found, rules
         desk.touch()
 
