@@ -223,7 +223,7 @@ def start_up() -> dict[str, float]:
 
 
 def parts_of(quick: bool) -> dict[str, Callable[[], Any]]:
-    """Return what measures each table: by its title, figures by name, rows by name, or rows."""
+    """Return the function that measures each table, by its title: figures by name, rows by name, or rows."""
     parts: dict[str, Callable[[], Any]] = {
         "ns per drive and tick": ticks,
         "us per axis and ms, 64 machines, 1 thread": bound,
