@@ -291,8 +291,8 @@ class Link(Protocol):
     def welcome(self, node: int) -> None:
         """Note that a node is there and is of the expected kind; read what the link must know of it."""
 
-    def start(self) -> None:
-        """Take the nodes to where they exchange process data."""
+    def start(self, nodes: Sequence[int] | None = None) -> None:
+        """Take nodes to where they exchange process data; None takes all of them."""
 
     def reset(self, nodes: Sequence[int]) -> None:
         """Restart nodes as after power-on, and wait until they are back.

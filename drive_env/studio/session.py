@@ -27,6 +27,7 @@ from drive_env.dictionary.quantities import Scale
 from drive_env.drives import motion
 from drive_env.drives.emergency import EmergencyMessage
 from drive_env.drives.interface import Drives
+from drive_env.fieldbus.errors import NoAnswerError
 from drive_env.master.parameters import parameters
 from drive_env.master.single_axes import SingleAxes
 from drive_env.safety.errors import SafetyError
@@ -443,6 +444,7 @@ class Session:
             self._tell_stop(error)
         except Exception as error:  # a node that is gone: told, and tried again
             self._failed_at = time.monotonic()
+            states.lose(error.silent if isinstance(error, NoAnswerError) else ())
             told = sentence(error)
             if not self.events or self.events[-1].text != told:
                 self.say("error", told)

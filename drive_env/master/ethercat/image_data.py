@@ -65,7 +65,8 @@ class ImageSamples:
         """Return the error for samples that stay out, of so many cycles and after so long a wait [s]."""
         return NoAnswerError(
             f"{len(self.rows)} input images came in {rows} cycles, and no more within {timeout:g} s; check cable and "
-            "power, and whether every drive is in Op"
+            "power, and whether every drive is in Op",
+            self._data.out_of_op(),
         )
 
     def close(self) -> None:
@@ -232,6 +233,16 @@ class EtherCatProcessData:
         """Slaves that do not have these images, by their number."""
         return [k for k in range(len(self._nodes)) if k not in self._ready]
 
+    def out_of_op(self) -> list[int]:
+        """Return the slaves that are not in Op, or do not answer, by their number; asked now."""
+        found = []
+        for k, position in enumerate(self._nodes):
+            with suppress(NoAnswerError):
+                if self._master.status(position).is_op:
+                    continue
+            found.append(k)
+        return found
+
     def prepare(self) -> None:
         """Give the slaves that are in Pre-Op their images, filled with their objects' values, and go to Safe-Op."""
         layouts = {direction: self._layout(direction) for direction in (OUTPUTS, INPUTS)}
@@ -246,10 +257,12 @@ class EtherCatProcessData:
         self._master.map(dict.fromkeys(self._nodes, sizes))
         self._ready = set(range(len(self._nodes)))
 
-    def operate(self) -> None:
-        """Take the slaves to Op."""
+    def operate(self, positions: Sequence[int] | None = None) -> None:
+        """Take slaves to Op, all of them for None."""
         exchange = None if self._lockstep else lambda: self.exchange(is_cycle=False)
-        self._master.operate(self._nodes, exchange and (lambda: _nothing(exchange())), LONGEST_STATE)
+        self._master.operate(
+            self._nodes if positions is None else positions, exchange and (lambda: _nothing(exchange())), LONGEST_STATE
+        )
         self.exchanged_at = time.monotonic()
 
     def leave(self) -> None:
