@@ -59,19 +59,19 @@ def test_what_is_known_of_a_machine(session):
 
 
 def test_parameters_torque_and_supply_act(session):
-    do(session, machine_jobs.set_parameter("load.inertia", 2e-5))
-    do(session, machine_jobs.set_load_torque(0.01))
-    do(session, machine_jobs.set_supply(30.0))
+    do(session, machine_jobs.set_parameters({"load.inertia": 2e-5}))
+    do(session, machine_jobs.act("load_torque", 0.01))
+    do(session, machine_jobs.act("supply", 30.0))
     found = session.glimpse(
         lambda machine: (machine.parameters["load.inertia"][0], machine.load_torque[0], machine.supply[0])
     )
     assert found == pytest.approx((2e-5, 0.01, 30.0))
     with pytest.raises(ValueError, match="must be finite and 0 V or more"):
-        do(session, machine_jobs.set_supply(-1.0))
+        do(session, machine_jobs.act("supply", -1.0))
     with pytest.raises(ValueError):
-        do(session, machine_jobs.set_parameter("load.inertia", -1.0))
-    do(session, machine_jobs.set_load_torque(0.0))
-    do(session, machine_jobs.set_supply(24.0))
+        do(session, machine_jobs.set_parameters({"load.inertia": -1.0}))
+    do(session, machine_jobs.act("load_torque", 0.0))
+    do(session, machine_jobs.act("supply", 24.0))
     do(session, machine_jobs.set_parameters({"load.inertia": 1e-5}))
     assert session.glimpse(lambda machine: machine.parameters["load.inertia"][0]) == pytest.approx(1e-5)
 

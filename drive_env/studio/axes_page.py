@@ -89,7 +89,8 @@ def _single_transitions(state: State | None) -> None:
         button = ui.button(f"{arrow.numbers} {arrow.name}").props("outline no-caps dense").classes("studio-transition")
         button.props(f"data-command={arrow.word}")
     if not leaving:
-        ui.label("None from this state: the drive goes on by itself.").classes("studio-hint")
+        none = "No state is known." if state is None else "None from this state: the drive goes on by itself."
+        ui.label(none).classes("studio-hint")
 
 
 def _motion_card(session: Session, visitor: Visitor) -> None:
