@@ -128,11 +128,17 @@ class AxisRoom(NamedTuple):
         return f"{self.low - self.here:.3g} to {self.high - self.here:.3g} rev"
 
 
-def signals_of(modes: tuple[str, ...], has: Callable[[Key], bool]) -> dict[str, str]:
-    """Return the titles of the signals that an axis can play by its modes and objects; {} if it tells no position."""
+def signals_of(
+    modes: tuple[str, ...], has: Callable[[Key], bool], plays: Callable[[Key], bool] | None = None
+) -> dict[str, str]:
+    """Return the titles of the signals that an axis can play by its modes and objects; {} if it tells no position.
+
+    `plays` tells which of its objects it takes with every cycle; None: all of them.
+    """
     if not (has((POSITION, 0)) and has((VELOCITY, 0))):
         return {}
-    return {name: one.title for name, one in SIGNALS.items() if one.mode in modes and has((one.target, 0))}
+    takes = lambda key: has(key) and (plays is None or plays(key))  # noqa: E731
+    return {name: one.title for name, one in SIGNALS.items() if one.mode in modes and takes((one.target, 0))}
 
 
 def course(settings: SignalSettings, cycle: float) -> Floats:

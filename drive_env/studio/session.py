@@ -308,6 +308,15 @@ class Session:
         """The scales of each axis' units; empty before the drives are open."""
         return () if self._states is None else self._states.scales
 
+    def plays(self, key: Key) -> bool:
+        """Return whether the drives take an object with every cycle; not every process image has room for it."""
+        bus = None if self._real is None else self._real.bus
+        with contextlib.suppress(ObjectAccessError):
+            if bus is not None:
+                bus.link.process.check_played([self.description.dictionary.find(key)])
+            return True
+        return False
+
     def forget_faults(self, axis: int) -> None:
         """Note that the faults of an axis were reset."""
         if self._states is not None:

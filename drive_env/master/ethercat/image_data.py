@@ -153,6 +153,7 @@ class EtherCatProcessData:
     def check_played(self, entries: Sequence[Entry]) -> None:
         """Raise ObjectAccessError 06040041h for an object that cannot be sent with every cycle."""
         self._check(entries, OUTPUTS, "played")
+        self._planner.plan(OUTPUTS, entries, self._layout(OUTPUTS))
 
     def choose(
         self, wanted: Sequence[Entry], welcome: Sequence[Entry], played: Sequence[Entry] = ()
