@@ -7,6 +7,7 @@ import pytest
 from rigs.ethercat_segment import linked
 from rigs.fault_injection import ON, served, until
 from rigs.session_rig import Beats
+from rigs.studio_rig import Tab, chromium, needs_chromium, studio
 from rigs.world_bus import WorldBus
 
 from drive_env import CanDrives, EmulatedDrives, SafetyError, motion
@@ -79,6 +80,24 @@ def test_a_node_that_missed_heartbeats_is_started_from_the_page_and_turns_again(
     do(session, motion_jobs.enable((0, 1), "pv"))
     do(session, lambda drives: motion.turn(drives, 100_000, None))
     until(lambda: (world.truth.omega()[-1] > TURNS).all(), "both axes' motion")
+
+
+@needs_chromium
+@pytest.mark.slow
+def test_the_page_offers_the_start_of_a_node_that_was_stopped(two):
+    with served(two, (1, 2)) as (world, channel):
+        faults, nodes = BusFaults(world), ("--node", "1", "--node", "2")
+        with studio("--channel", channel, *nodes, "--timeout", "0.5") as made, chromium() as driver:
+            tab = Tab(driver, made).open("/axes")
+            tab.await_state("Switch on disabled")
+            assert not tab.named("silent").is_displayed()
+            faults.add(parse_order("second_master node=1 command=2 duration=0.05"))
+            until(lambda: tab.named("silent").is_displayed(), "the silence")
+            tab.await_state("unknown")
+            tab.press("start-node")
+            tab.await_state("Switch on disabled")
+            until(lambda: not tab.named("silent").is_displayed(), "its end")
+        assert not np.isin(world.truth.fsa(), ON).any()
 
 
 @pytest.fixture

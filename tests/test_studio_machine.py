@@ -84,8 +84,8 @@ def test_a_fault_that_is_switched_on_acts_and_one_that_is_ended_does_not(session
         (number, "supply_dip", True)
     ]
     assert session.glimpse(lambda machine: machine.supply[0]) == pytest.approx(5.0)
-    do(session, machine_jobs.end_fault(number))
-    do(session, machine_jobs.end_fault(number))  # it is over already
+    do(session, machine_jobs.end_faults("supply_dip"))
+    do(session, machine_jobs.end_faults("supply_dip"))  # it is over already
     do(session, lambda drives: drives.advance(0.1))
     assert session.glimpse(lambda machine: machine.supply[0]) == pytest.approx(24.0)
     do(session, motion_jobs.reset_fault(0))

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any
 
-from drive_env.drives import motion
 from drive_env.drives.interface import Drives, machine_of
-from drive_env.studio.motion_jobs import only
+from drive_env.studio import motion_jobs
 
 if TYPE_CHECKING:
     from drive_env.emulator.machine import Machines
@@ -29,29 +28,27 @@ def begin_fault(name: str, duration: float | None, when: str, given: Mapping[str
     return lambda drives: _machines(drives).fault(name, duration=duration, when=when, **numbers)
 
 
-def end_fault(number: int | None) -> Callable[[Drives], None]:
-    """Return the job that ends a fault, None all of them; one that is over already is no error."""
-    return lambda drives: _end(drives, lambda fault: number in (None, fault.number))
-
-
-def take_step(step: str, name: str, axis: int) -> Callable[[Drives], None]:
-    """Return the job that takes a step of the way back from a fault (`STEPS`), of an axis where it is of one."""
+def end_faults(name: str | None) -> Callable[[Drives], None]:
+    """Return the job that ends the faults of a name, None all of them; those that are over already are no error."""
 
     def job(drives: Drives) -> None:
-        where = only(drives, axis)
-        if step == "end":
-            _end(drives, lambda fault: fault.order.name == name)
-        elif step == "reset_fault":
-            motion.reset_fault(drives, where=where)
-        else:
-            (drives.start_node if step == "start_node" else drives.reset_node)(where)
+        machines = _machines(drives)
+        for fault in machines.faults():
+            if name in (None, fault.order.name):
+                machines.clear_fault(fault.number)
 
     return job
 
 
-def _end(drives: Drives, which: Callable[[Any], bool]) -> None:
-    for fault in filter(which, _machines(drives).faults()):
-        _machines(drives).clear_fault(fault.number)
+def take_step(step: str, name: str, axis: int) -> Callable[[Drives], None]:
+    """Return the job that takes a step of the way back from a fault (`STEPS`), of an axis where it is of one."""
+    if step == "end":
+        return end_faults(name)
+    if step == "reset_fault":
+        return motion_jobs.reset_fault(axis)
+    if step == "start_node":
+        return motion_jobs.start_node(axis)
+    return lambda drives: drives.reset_node(motion_jobs.only(drives, axis))
 
 
 def _machines(drives: Drives) -> Machines:

@@ -267,12 +267,12 @@ class MachinePanel:
                     "dense outlined data-test=fault-when"
                 ).classes("grow")  # fmt: skip
                 ui.button(
-                    "End all", icon="healing", on_click=lambda: self._do(jobs.end_fault(None), "End all faults")
+                    "End all", icon="healing", on_click=lambda: self._do(jobs.end_faults(None), "End all faults")
                 ).props("outline no-caps data-test=end-faults")
             boxes: dict[str, ui.element] = {}
             self._reactions: dict[str, tuple[ui.element, ui.label]] = {}
             switches: dict[str, ui.switch] = {}
-            numbers: dict[str, list[int]] = {}
+            present: set[str] = set()
             for group in GROUPS:
                 names = [name for name in self._known.faults if FAULTS[name].group == group]
                 if names:
@@ -283,16 +283,14 @@ class MachinePanel:
                         ui.element("div").classes("studio-faults"),
                     ):
                         for name in names:
-                            boxes[name] = self._fault(FAULTS[name], lasts, when, switches, numbers)
+                            boxes[name] = self._fault(FAULTS[name], lasts, when, switches, present)
 
         def show() -> None:
             faults = self._session.glimpse(lambda machine: machine.faults(), 0.05)
             if faults is None:
                 return
-            numbers.clear()
-            for fault in faults:
-                if fault.active.any() or fault.waiting.any():
-                    numbers.setdefault(fault.order.name, []).append(fault.number)
+            present.clear()
+            present.update(fault.order.name for fault in faults if fault.active.any() or fault.waiting.any())
             active = {fault.order.name for fault in faults if fault.active.any()}
             self._is_setting = True
             shown = _shown(self._visitor.state)
@@ -304,14 +302,14 @@ class MachinePanel:
                     reaction.set_visibility(True)
                 box.classes(add="is-active" if is_on else "", remove="" if is_on else "is-active")
                 if name in switches:
-                    switches[name].set_value(name in numbers)
+                    switches[name].set_value(name in present)
             self._is_setting = False
 
         ui.timer(REFRESH, show)
 
     def _fault(
         self, row: FaultRow, lasts: ui.number, when: ui.input, switches: dict[str, ui.switch],
-        numbers: dict[str, list[int]],
+        present: set[str],
     ) -> ui.element:  # fmt: skip
         fields: dict[str, ui.number] = {}
         with ui.element("div").classes("studio-fault-row") as box:
@@ -342,13 +340,12 @@ class MachinePanel:
             self._reactions[row.name][0].set_visibility(True)
 
         async def flip(is_on: bool) -> None:
-            if self._is_setting or is_on == (row.name in numbers):
+            if self._is_setting or is_on == (row.name in present):
                 return
             if is_on:
                 await begin()
             else:
-                for number in numbers.get(row.name, []):
-                    await self._do(jobs.end_fault(number), f"End: {row.title}")
+                await self._do(jobs.end_faults(row.name), f"End: {row.title}")
 
         return box
 
