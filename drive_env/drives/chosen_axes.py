@@ -100,8 +100,7 @@ class ChosenAxes(DrivesProxy):
 
     def write(self, name: ObjectName, value: ArrayLike, where: Mask | None = None) -> None:
         """Write an object of every chosen axis, or of some of them."""
-        mask = np.zeros(self._drives.num_axes, bool)
-        mask[self._axes[checked_mask(where, self.num_axes)]] = True
+        mask = self._of_all(where)
         if isinstance(value, str) or np.ndim(value) == 0:
             self._drives.write(name, value, where=mask)
             return
@@ -111,6 +110,12 @@ class ChosenAxes(DrivesProxy):
         whole = np.full(self._drives.num_axes, given[0], given.dtype)  # values for the other axes are not written
         whole[self._axes] = given
         self._drives.write(name, whole, where=mask)
+
+    def _of_all(self, where: Mask | None) -> Mask:
+        """Return a mask of the chosen axes as one of all axes."""
+        mask = np.zeros(self._drives.num_axes, bool)
+        mask[self._axes[checked_mask(where, self.num_axes)]] = True
+        return mask
 
     def record(self, objects: ObjectNames, duration: float, play: Rows = None, period: float = 0.001) -> Trace:
         """Let time pass while objects of the chosen axes are recorded and played."""
@@ -134,6 +139,10 @@ class ChosenAxes(DrivesProxy):
     def reset_node(self, where: Mask | None = None) -> None:
         """Refuse: a node restarts with all of its axes."""
         raise ValueError("a node is reset with all its axes, and some are left out here; open it with all of them")
+
+    def start_node(self, where: Mask | None = None) -> None:
+        """Start the nodes of the chosen axes, or of some of them."""
+        self._drives.start_node(self._of_all(where))
 
 
 class ChosenWatch:

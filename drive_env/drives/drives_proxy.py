@@ -92,6 +92,10 @@ class DrivesProxy:
         """Restart nodes, as after power-on."""
         self._drives.reset_node(where)
 
+    def start_node(self, where: Mask | None = None) -> None:
+        """Start nodes that have left operational."""
+        self._drives.start_node(where)
+
     def close(self) -> None:
         """Release what the drives hold."""
         self._drives.close()

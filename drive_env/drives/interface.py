@@ -202,6 +202,9 @@ class Drives(BasicDrives, Protocol):
     def reset_node(self, where: Mask | None = None) -> None:
         """Restart nodes, as after power-on."""
 
+    def start_node(self, where: Mask | None = None) -> None:
+        """Start nodes that have left operational, as after missed heartbeats; no motor runs by it."""
+
     def close(self) -> None:
         """Release the drives' resources."""
 

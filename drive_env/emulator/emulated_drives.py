@@ -285,6 +285,10 @@ class EmulatedDrives(Saved):
         """Reset the drives (NMT reset node): values return to the stored ones, the automaton starts anew."""
         self.inside.objects.restart(checked_mask(where, self.num_axes))
 
+    def start_node(self, where: Mask | None = None) -> None:
+        """Do nothing: drives in this process have no communication that has stopped."""
+        checked_mask(where, self.num_axes)
+
     # --- states ---------------------------------------------------------------------------------------------------
     def save_state(self) -> State:
         """Return the complete state of drives and machines, bit by bit, as plain data that can be pickled."""

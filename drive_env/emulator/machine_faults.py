@@ -274,7 +274,7 @@ class MachineFaults:
     def _changes(self, name: str) -> tuple[Change, ...]:
         load = self._inside.load
         names = tuple(parameter.name for parameter in load.parameters)
-        changes = changes_of(name, names, str(load.name), self._axes_per_machine)
+        changes = changes_of(name, names, str(load.name), self._axes_per_machine, bool(load.switches))
         device = self._inside.device
         return of_drives(name, changes, device.firmware.layout.dtype.names or (), device.name)
 

@@ -53,6 +53,10 @@ def _shorted(number: int) -> Callable[[Floats, Given, float], Floats]:
     return lambda sound, given, rated: sound + given["conductance"] if given["phase"] == number else sound
 
 
+def _pressed(number: int, end: float) -> Callable[[Floats, Given, float], Floats]:
+    return lambda sound, given, rated: np.full_like(sound, end) if given["switch"] == number else sound
+
+
 def _left(sound: Floats, given: Given, rated: float) -> Floats:
     return sound * given["left"]
 
@@ -84,6 +88,13 @@ CHANGES: dict[str, tuple[Change, ...]] = {
     ),
     "supply_dip": (_record("supply_voltage", lambda sound, given, rated: np.minimum(sound, given["voltage"])),),
     "supply_surge": (_record("supply_voltage", lambda sound, given, rated: np.maximum(sound, given["voltage"])),),
+    "brake_stuck": (_record("brake_mode", _broken),),
+    # Pressed wherever the load is.
+    "limit_switch": tuple(
+        _record(name, _pressed(number, end), number)
+        for number in (0, 1)
+        for name, end in (("switch_low", -np.inf), ("switch_high", np.inf))
+    ),
     "enable_lost": (_record("enable_input", _vanished),),
     "jam": (Change(Quantity("jam"), lambda sound, given, rated: sound + given["torque"] * rated),),
     "broken_coupling": tuple(Change(Quantity("load", name), _vanished) for name in ("stiffness", "damping")),
@@ -112,7 +123,9 @@ def of_drives(name: str, changes: tuple[Change, ...], fields: Collection[str], d
     return found
 
 
-def changes_of(name: str, load_parameters: tuple[str, ...], load: str, num_axes: int) -> tuple[Change, ...]:
+def changes_of(
+    name: str, load_parameters: tuple[str, ...], load: str, num_axes: int, has_switches: bool = True
+) -> tuple[Change, ...]:
     """Return the changes that a fault makes to a machine.
 
     Args:
@@ -120,6 +133,7 @@ def changes_of(name: str, load_parameters: tuple[str, ...], load: str, num_axes:
         load_parameters: Names of the load's parameters.
         load: Name of the load, for messages.
         num_axes: Axes of a machine.
+        has_switches: Whether the load has limit switches.
 
     Raises:
         ValueError: If the load does not have what the fault changes.
@@ -129,6 +143,10 @@ def changes_of(name: str, load_parameters: tuple[str, ...], load: str, num_axes:
         raise ValueError(
             f"fault broken_coupling: load {load!r} has no coupling between one rotor and its load that could break; "
             "take one that has: two_mass, three_mass, belt, ball_screw, vertical_screw, geared_joint"
+        )
+    if name == "limit_switch" and not has_switches:
+        raise ValueError(
+            f"fault limit_switch: load {load!r} has no switches; take one that has: belt, ball_screw, gantry"
         )
     if name == "payload_jump":
         found = [change for change in changes if change.quantity.name in load_parameters]

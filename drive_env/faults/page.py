@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 from drive_env.default_device import DEFAULT_DEVICE
-from drive_env.devices import find_device
+from drive_env.devices import device_names, find_device
 from drive_env.faults.table import FAULTS, GROUPS, FaultRow
 
 HEADINGS = {
@@ -94,9 +94,19 @@ def _section(row: FaultRow) -> str:
         lines.append("")
     if row.once:
         lines.append("A moment: it takes no duration.\n")
-    lines += [f"- **Drive:** {row.drive}", f"- **Master:** {row.master}", f"- **Way back:** {row.recovery}"]
+    lines.append(f"- **Drive:** {row.drive}")
+    lines += [_elsewhere(row, firmware) for firmware in row.on if row.on[firmware]]
+    lines += [f"- **Master:** {row.master}", f"- **Way back:** {row.way_back}"]
     lines.append(f"- **Test:** `{row.test}`\n")
     return "\n".join(lines)
+
+
+def _elsewhere(row: FaultRow, firmware: str) -> str:
+    """Return the line of what drives of another firmware make of a fault."""
+    other = row.on_firmware(firmware)
+    assert other is not None
+    names = ", ".join(f"`{name}`" for name in device_names() if find_device(name).firmware_name == firmware)
+    return f"- **{names}:** {other.drive}" + ("" if other.steps == row.steps else f" Way back: {other.way_back}")
 
 
 def main() -> None:

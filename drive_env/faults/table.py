@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from mechanics.reading.near_names import did_you_mean
 from mechanics.reading.untrusted import read_toml
 
+OWN = "servo"  # the firmware of the drive whose reactions the rows have
+STEPS = {
+    "end": "Remove the cause",
+    "start_node": "Start the node (NMT)",
+    "reset_node": "Reset the node, which aligns the commutation",
+    "reset_fault": "Reset the fault",
+    "home": "Home again: counts are wrong",
+}
 GROUPS = ("sensor", "motor", "supply", "load", "bus", "node")
 
 
@@ -31,7 +40,10 @@ class FaultParameter:
 
 @dataclass(frozen=True)
 class FaultRow:
-    """A fault; table.toml explains each field. `emergency` is None where the drive does not detect it."""
+    """A fault; table.toml explains each field. `emergency` is None where the drive does not detect it.
+
+    Its reaction is that of one drive; `on_firmware` has those of others.
+    """
 
     name: str
     group: str
@@ -39,12 +51,28 @@ class FaultRow:
     physics: str
     drive: str
     master: str
-    recovery: str
     test: str
+    recovery: str = ""
     emergency: int | None = None
     detection: float | None = None
     once: bool = False
     parameters: Mapping[str, FaultParameter] = field(default_factory=dict)
+    steps: Sequence[str] = ("end", "reset_fault")
+    on: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+    @property
+    def way_back(self) -> str:
+        """The steps of the way back as sentences, and what they leave out."""
+        return " ".join([*(f"{STEPS[step]}." for step in self.steps), self.recovery]).strip()
+
+    def on_firmware(self, name: str) -> FaultRow | None:
+        """Return the row as it holds for drives of a firmware; None if it is not known what they make of it."""
+        if name == OWN:
+            return self
+        if name not in self.on:
+            return None
+        found = replace(self, **self.on[name])
+        return replace(found, emergency=found.emergency or None)
 
 
 def _rows() -> dict[str, FaultRow]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from drive_env.dictionary.aborts import ObjectAccessError
 
 # CiA 301, table 22 of version 4.2, and the remedies.
@@ -45,7 +47,11 @@ class OpenError(BusError):
 
 
 class NoAnswerError(BusError, TimeoutError):
-    """A node did not answer in time."""
+    """A node did not answer in time; `silent` are those that sent no process data, by position, as far as known."""
+
+    def __init__(self, told: str = "", silent: Sequence[int] = ()) -> None:
+        super().__init__(told)
+        self.silent = tuple(silent)
 
 
 class RefusedError(ObjectAccessError):

@@ -292,8 +292,8 @@ class Link(Protocol):
     def welcome(self, node: int) -> None:
         """Note that a node is there and of the expected kind; read the data that the link needs of it."""
 
-    def start(self) -> None:
-        """Make the nodes operational, so that they exchange process data."""
+    def start(self, nodes: Sequence[int] | None = None) -> None:
+        """Make nodes operational, so that they exchange process data; None: all of them."""
 
     def reset(self, nodes: Sequence[int]) -> None:
         """Restart nodes as after power-on, and wait until they are back.

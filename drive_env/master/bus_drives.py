@@ -39,7 +39,7 @@ from drive_env.held_signals import held_signals
 from drive_env.master.cycle_runner import CycleRunner
 from drive_env.master.pace import Pace
 from drive_env.master.sampling import run_cycles
-from drive_env.safety.envelope import Envelope
+from drive_env.safety.envelope import Envelope, SafetyError
 from drive_env.safety.watched_drives import CycleWatch
 from mechanics.arrays import Integers, Mask
 
@@ -251,6 +251,35 @@ class BusDrives:
         self.forget(chosen)
         if self.safety is not None:
             self.safety.after_reset(chosen)
+
+    def start_node(self, where: Mask | None = None) -> None:
+        """Start the nodes of some axes that have left operational, as after missed heartbeats; no motor runs by it.
+
+        What their axes were commanded before is taken back first: no axis is more than switched off when its node
+        takes process data again. Other nodes are left as they are.
+
+        Raises:
+            SafetyError: If an axis of these nodes is live, or one could not be proved off before; none is started.
+            NoAnswerError: If a node does not answer although it was woken.
+        """
+        self._enter()
+        if self.safety is not None:
+            self.safety.before_start()
+        per_node = self._description.num_axes
+        chosen = sorted({int(axis) // per_node for axis in np.flatnonzero(checked_mask(where, self.num_axes))})
+        axes = [axis for k in chosen for axis in range(k * per_node, (k + 1) * per_node)]
+        status, word = (self._description.dictionary.find(key) for key in (cia402.STATUSWORD, cia402.CONTROLWORD))
+        for k in chosen:
+            self._wake(k)
+        for axis in axes:
+            if cia402.is_live(found := self.read_raw(status, axis)):
+                raise SafetyError(
+                    f"axis {axis} is live (6041h = {found:04X}h), and its node is not started under it; quick-stop or "
+                    "disable it first"
+                )
+        for axis in axes:
+            self.write_raw(word, axis, cia402.DISABLE_VOLTAGE)
+        self._link.start(chosen)
 
     def close(self) -> None:
         """Stop axes that still run, restore process data and watchdogs, and close the bus, which ends its use."""

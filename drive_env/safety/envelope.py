@@ -352,6 +352,11 @@ class Envelope:
         if self._axes.rotor.is_placed:
             self._limits.place()
 
+    def before_start(self) -> None:
+        """Have a stop come to its end; raise SafetyError where an axis could not be proved off by it."""
+        self._watch.await_stop()
+        self._check_none_lost()
+
     def restarted(self, node: int) -> None:
         """Note that a node (by position) has booted without a reset of ours."""
         if self._is_ours():
@@ -531,11 +536,7 @@ class Envelope:
         Raises:
             SafetyError: If an axis cannot be watched; BusError or ObjectAccessError if a node does not answer.
         """
-        if self._axes.lost:
-            raise SafetyError(
-                f"axis {min(self._axes.lost)} could not be confirmed to be off, and is left to its watchdog; check "
-                "it, and open the drives again"
-            )
+        self._check_none_lost()
         self._drives.start()
         if self._axes.is_armed:
             return
@@ -555,6 +556,13 @@ class Envelope:
             raise
         self._axes.is_armed = True
         signals.guard(self)
+
+    def _check_none_lost(self) -> None:
+        if self._axes.lost:
+            raise SafetyError(
+                f"axis {min(self._axes.lost)} could not be confirmed to be off, and is left to its watchdog; check "
+                "it, and open the drives again"
+            )
 
     def _lend(self) -> None:
         """Lend the drives limits that are tighter than their own, and ramps for stops by which they would coast."""

@@ -52,15 +52,26 @@ async def _command(event: GenericEventArguments, visitor: Visitor) -> None:
 
 
 def _state_card(session: Session, visitor: Visitor) -> None:
+    async def start() -> None:
+        await visitor.do(motion_jobs.start_node(visitor.axis), f"Start the node of axis {visitor.axis}")
+
     with card("State (CiA 402)", "card-state"):
         picture = ui.html(diagram(None), sanitize=False).classes("w-full")
         power_row(visitor)
+        silent = ui.element("div").classes("studio-fault").props('data-test=silent role="status"')
+        with silent:
+            ui.label("▲ The axis' node sends no process data: it has left operational, or has no power.").classes(
+                "studio-strong"
+            )
+            ui.button("Start node", icon="play_circle", on_click=start).props("outline no-caps data-test=start-node")
+            ui.label("The axis stays off: reset its fault, and enable it, afterwards.").classes("studio-hint")
         ui.label("Single transitions, also by a lit arrow:").classes("studio-label")
         single = ui.row().classes("studio-buttons")
     shown: list[object] = [object()]
 
     def show() -> None:
         state = visitor.state
+        silent.set_visibility(state is not None and state.is_silent)
         if state is not None and state.state is not shown[0]:
             shown[0] = state.state
             picture.set_content(diagram(state.state))
@@ -78,7 +89,8 @@ def _single_transitions(state: State | None) -> None:
         button = ui.button(f"{arrow.numbers} {arrow.name}").props("outline no-caps dense").classes("studio-transition")
         button.props(f"data-command={arrow.word}")
     if not leaving:
-        ui.label("None from this state: the drive goes on by itself.").classes("studio-hint")
+        none = "No state is known." if state is None else "None from this state: the drive goes on by itself."
+        ui.label(none).classes("studio-hint")
 
 
 def _motion_card(session: Session, visitor: Visitor) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import isfinite
 from typing import TYPE_CHECKING, Any
@@ -78,6 +78,7 @@ class AxisState:
         slow: Temperatures, DC link and the like.
         is_at_limit: Whether its current is at the limit though it does not turn.
         current_share: Share of the limit that its current is; None where the drive tells no limit.
+        is_silent: Whether its node sends no process data: it has left operational, or is gone.
     """
 
     axis: int
@@ -92,6 +93,7 @@ class AxisState:
     slow: tuple[ShownQuantity, ...] = ()
     is_at_limit: bool = False
     current_share: float | None = None
+    is_silent: bool = False
 
     @property
     def is_enabled(self) -> bool:
@@ -173,6 +175,12 @@ class AxisStates:
         """Note that the faults of an axis were reset."""
         self._replace(axis, faults=())
 
+    def lose(self, silent: Sequence[int]) -> None:
+        """Note that nothing came from the drives, so that no state is known; `silent` are the nodes that are why."""
+        for axis in self.axes:
+            is_silent = axis.axis // self._known.num_axes in silent
+            self._replace(axis.axis, status=0, state=None, is_silent=is_silent)
+
     # --- inside ---------------------------------------------------------------------------------------------------
     def _replace(self, axis: int, **changes: Any) -> None:
         self.axes = tuple(replace(one, **changes) if one.axis == axis else one for one in self.axes)
@@ -194,7 +202,7 @@ class AxisStates:
             status = int(newest[cia402.STATUSWORD, 0][axis])
             quantities = tuple(self._quantity(key, int(newest[key][axis]), axis) for key in self.sampled[1:])
             state = cia402.state_of(status)
-            self._replace(axis, status=status, state=state, motion=quantities)
+            self._replace(axis, status=status, state=state, motion=quantities, is_silent=False)
         return self._note_limits(newest)
 
     def _note_limits(self, newest: Mapping[Key, Any]) -> list[str]:

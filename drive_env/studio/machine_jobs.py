@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from drive_env.drives.interface import Drives, machine_of
+from drive_env.studio import motion_jobs
 
-
-def set_parameter(name: str, value: float) -> Callable[[Drives], None]:
-    """Return the job that gives the machine a true parameter [SI]."""
-    return lambda drives: machine_of(drives).set(name, value)
+if TYPE_CHECKING:
+    from drive_env.emulator.machine import Machines
 
 
 def set_parameters(values: Mapping[str, float]) -> Callable[[Drives], None]:
@@ -18,44 +17,41 @@ def set_parameters(values: Mapping[str, float]) -> Callable[[Drives], None]:
     return lambda drives: machine_of(drives).set_all(values)
 
 
-def set_load_torque(value: float) -> Callable[[Drives], None]:
-    """Return the job that lets a torque act on the load [N*m, or N where it moves in a line]."""
-
-    def job(drives: Drives) -> None:
-        machine_of(drives).load_torque = value
-
-    return job
-
-
-def set_supply(value: float) -> Callable[[Drives], None]:
-    """Return the job that sets the open-circuit voltage of the supply [V]."""
-
-    def job(drives: Drives) -> None:
-        machine_of(drives).supply = value
-
-    return job
+def act(quantity: str, value: float) -> Callable[[Drives], None]:
+    """Return the job that sets "load_torque" [N*m, or N of a load that moves in a line] or "supply" [V]."""
+    return lambda drives: setattr(machine_of(drives), quantity, value)
 
 
 def begin_fault(name: str, duration: float | None, when: str, given: Mapping[str, Any]) -> Callable[[Drives], int]:
     """Return the job that lets something fail, and returns the fault's number."""
-
-    def job(drives: Drives) -> int:
-        from drive_env.emulator.emulated_drives import emulated_of
-
-        numbers: Any = dict(given)
-        return emulated_of(drives).machine.fault(name, duration=duration, when=when, **numbers)
-
-    return job
+    numbers: Any = dict(given)
+    return lambda drives: _machines(drives).fault(name, duration=duration, when=when, **numbers)
 
 
-def end_fault(number: int | None) -> Callable[[Drives], None]:
-    """Return the job that ends a fault, None all of them; one that is over already is no error."""
+def end_faults(name: str | None) -> Callable[[Drives], None]:
+    """Return the job that ends the faults of a name, None all of them; those that are over already are no error."""
 
     def job(drives: Drives) -> None:
-        from drive_env.emulator.emulated_drives import emulated_of
-
-        machine = emulated_of(drives).machine
-        if number is None or any(fault.number == number for fault in machine.faults()):
-            machine.clear_fault(number)
+        machines = _machines(drives)
+        for fault in machines.faults():
+            if name in (None, fault.order.name):
+                machines.clear_fault(fault.number)
 
     return job
+
+
+def take_step(step: str, name: str, axis: int) -> Callable[[Drives], None]:
+    """Return the job that takes a step of the way back from a fault (`STEPS`), of an axis where it is of one."""
+    if step == "end":
+        return end_faults(name)
+    if step == "reset_fault":
+        return motion_jobs.reset_fault(axis)
+    if step == "start_node":
+        return motion_jobs.start_node(axis)
+    return lambda drives: drives.reset_node(motion_jobs.only(drives, axis))
+
+
+def _machines(drives: Drives) -> Machines:
+    from drive_env.emulator.emulated_drives import emulated_of
+
+    return emulated_of(drives).machine

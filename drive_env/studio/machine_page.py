@@ -7,13 +7,16 @@ import contextlib
 import math
 import weakref
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from fastapi import FastAPI, WebSocket, WebSocketDisconnect
 from nicegui import ui
 
-from drive_env.faults.table import FAULTS, GROUPS, FaultRow
+from drive_env.faults.table import FAULTS, GROUPS, STEPS, FaultRow
 from drive_env.studio import machine_jobs as jobs
+from drive_env.studio.axis_states import AxisState
+from drive_env.studio.layout import state_name
 from drive_env.studio.machine_camera import MachineCamera
 from drive_env.studio.page import StudioPage
 from drive_env.studio.sentences import sentence
@@ -161,11 +164,11 @@ class MachinePanel:
             unit, reach = known.torque_unit, 1.5 * known.torque
             self._control(
                 f"{'Force' if unit == 'N' else 'Torque'} on the load", unit, 0.0, (-reach, reach), "load-torque",
-                lambda value: self._do(jobs.set_load_torque(value), f"Load {value:.4g} {unit}"),
+                lambda value: self._do(jobs.act("load_torque", value), f"Load {value:.4g} {unit}"),
             )  # fmt: skip
             self._control(
                 "Supply voltage", "V", known.supply, (0.0, 1.5 * known.supply), "supply",
-                lambda value: self._do(jobs.set_supply(value), f"Supply {value:.4g} V"),
+                lambda value: self._do(jobs.act("supply", value), f"Supply {value:.4g} V"),
             )  # fmt: skip
             ui.label("The load goes up to 1.5 times what needs the motor's rated torque.").classes("studio-hint")
 
@@ -232,7 +235,7 @@ class MachinePanel:
         ends = min(row.low, row.ideal, row.default), max(row.high, row.ideal, row.default)
 
         async def act(wanted: float) -> None:
-            await self._do(jobs.set_parameter(name, wanted), f"{name} {wanted:.4g} {row.unit}")
+            await self._do(jobs.set_parameters({name: wanted}), f"{name} {wanted:.4g} {row.unit}")
 
         self._rows[name] = self._control(
             title[:1].upper() + title[1:], row.unit, value, ends, name.replace(".", "-"), act,
@@ -254,7 +257,7 @@ class MachinePanel:
     # --- faults ---------------------------------------------------------------------------------------------------
     def _fault_card(self) -> None:
         with self._card("Faults", "faults"):
-            ui.label("What fails here fails in the machine; what the drive makes of it is the page Axes.").classes(
+            ui.label("What fails here fails in the machine; below it stands what the drive makes of it.").classes(
                 "studio-hint"
             )
             with ui.row().classes("studio-buttons"):
@@ -264,11 +267,12 @@ class MachinePanel:
                     "dense outlined data-test=fault-when"
                 ).classes("grow")  # fmt: skip
                 ui.button(
-                    "End all", icon="healing", on_click=lambda: self._do(jobs.end_fault(None), "End all faults")
+                    "End all", icon="healing", on_click=lambda: self._do(jobs.end_faults(None), "End all faults")
                 ).props("outline no-caps data-test=end-faults")
             boxes: dict[str, ui.element] = {}
+            self._reactions: dict[str, tuple[ui.element, ui.label]] = {}
             switches: dict[str, ui.switch] = {}
-            numbers: dict[str, list[int]] = {}
+            present: set[str] = set()
             for group in GROUPS:
                 names = [name for name in self._known.faults if FAULTS[name].group == group]
                 if names:
@@ -279,30 +283,33 @@ class MachinePanel:
                         ui.element("div").classes("studio-faults"),
                     ):
                         for name in names:
-                            boxes[name] = self._fault(FAULTS[name], lasts, when, switches, numbers)
+                            boxes[name] = self._fault(FAULTS[name], lasts, when, switches, present)
 
         def show() -> None:
             faults = self._session.glimpse(lambda machine: machine.faults(), 0.05)
             if faults is None:
                 return
-            numbers.clear()
-            for fault in faults:
-                if fault.active.any() or fault.waiting.any():
-                    numbers.setdefault(fault.order.name, []).append(fault.number)
+            present.clear()
+            present.update(fault.order.name for fault in faults if fault.active.any() or fault.waiting.any())
             active = {fault.order.name for fault in faults if fault.active.any()}
             self._is_setting = True
+            shown = _shown(self._visitor.state)
             for name, box in boxes.items():
                 is_on = name in active
+                reaction, told = self._reactions[name]
+                told.set_text(shown)
+                if is_on:
+                    reaction.set_visibility(True)
                 box.classes(add="is-active" if is_on else "", remove="" if is_on else "is-active")
                 if name in switches:
-                    switches[name].set_value(name in numbers)
+                    switches[name].set_value(name in present)
             self._is_setting = False
 
         ui.timer(REFRESH, show)
 
     def _fault(
         self, row: FaultRow, lasts: ui.number, when: ui.input, switches: dict[str, ui.switch],
-        numbers: dict[str, list[int]],
+        present: set[str],
     ) -> ui.element:  # fmt: skip
         fields: dict[str, ui.number] = {}
         with ui.element("div").classes("studio-fault-row") as box:
@@ -324,22 +331,65 @@ class MachinePanel:
                     ).props("dense outlined")
                     fields[key].tooltip(f"{parameter.meaning}: {parameter.low:g} to {parameter.high:g}")
             ui.label(row.physics).classes("studio-hint")
+            self._reaction(row)
 
         async def begin() -> None:
             given = {key: float(field.value) for key, field in fields.items() if field.value is not None}
             duration = None if row.once or not lasts.value else float(lasts.value)
             await self._do(jobs.begin_fault(row.name, duration, when.value or "", given), row.title)
+            self._reactions[row.name][0].set_visibility(True)
 
         async def flip(is_on: bool) -> None:
-            if self._is_setting or is_on == (row.name in numbers):
+            if self._is_setting or is_on == (row.name in present):
                 return
             if is_on:
                 await begin()
             else:
-                for number in numbers.get(row.name, []):
-                    await self._do(jobs.end_fault(number), f"End: {row.title}")
+                await self._do(jobs.end_faults(row.name), f"End: {row.title}")
 
         return box
+
+    def _reaction(self, row: FaultRow) -> None:
+        """Make what the drive should show of a fault beside what it shows, and the steps of the way back."""
+        device = self._session.description.device
+        known = None if device is None else row.on_firmware(device.firmware_name)
+        with ui.column().classes("w-full gap-2").props(f"data-test=reaction-{row.name}") as reaction:
+            ui.label(f"Should show: {_expected(known)}").classes("studio-strong")
+            told = ui.label("").props(f"data-test=shows-{row.name}")
+            if known is not None:
+                ui.label(known.drive).classes("studio-hint")
+            with ui.row().classes("studio-buttons"):
+                for number, step in enumerate(() if known is None else known.steps, 1):
+                    text = f"{number} {STEPS[step]}"
+                    if step == "home":
+                        ui.link(text, f"/axes?axis={self._visitor.axis}")
+                        continue
+                    ui.button(text, on_click=partial(self._take, step, row)).props(
+                        f"outline no-caps dense data-test=step-{row.name}-{step}"
+                    )
+        reaction.set_visibility(False)
+        self._reactions[row.name] = reaction, told
+
+    async def _take(self, step: str, row: FaultRow) -> None:
+        axis = self._visitor.axis
+        await self._do(jobs.take_step(step, row.name, axis), f"{STEPS[step]}, axis {axis}")
+        if step != "end" and (state := self._visitor.state) is not None and not state.is_in_fault:
+            self._session.forget_faults(axis)
+
+
+def _expected(row: FaultRow | None) -> str:
+    """Return in words what a drive tells of a fault; None where the table does not know the drive."""
+    if row is None:
+        return "not known of this drive, what follows is its emulator's word alone"
+    return "no emergency: this drive does not see it" if row.emergency is None else f"emergency {row.emergency:04X}h"
+
+
+def _shown(state: AxisState | None) -> str:
+    """Return the emergencies of an axis since its last reset, and its state, in words; "" for no axis."""
+    if state is None:
+        return ""
+    codes = ", ".join(f"{fault.code:04X}h {fault.text.name}" for fault in state.faults) or "no emergency"
+    return f"Shows: {codes}; {state_name(state.state)} (axis {state.axis})"
 
 
 def _truth(machine: Machines) -> str:

@@ -140,7 +140,7 @@ def home_rows(session: Session, visitor: Visitor) -> None:
 
 def signal_rows(session: Session, visitor: Visitor) -> None:
     """Make the rows that play a test signal on the axis of a page."""
-    titles = signals_of(_modes(visitor.state), session.description.has)
+    titles = signals_of(_modes(visitor.state), session.description.has, session.plays)
     if not titles:
         ui.label("This drive has no mode in which set-points are played (csp, csv, cst).").classes("studio-hint")
         return

@@ -75,6 +75,11 @@ def reset_fault(axis: int) -> MotionJob:
     return lambda drives: motion.reset_fault(drives, where=only(drives, axis))
 
 
+def start_node(axis: int) -> MotionJob:
+    """Return the job that starts the node of an axis, which stays off."""
+    return lambda drives: drives.start_node(only(drives, axis))
+
+
 def command(axis: int, word: int) -> MotionJob:
     """Return the job that writes a controlword of the state machine; one that enables moves to no target of before."""
 

@@ -128,11 +128,20 @@ class AxisRoom(NamedTuple):
         return f"{self.low - self.here:.3g} to {self.high - self.here:.3g} rev"
 
 
-def signals_of(modes: tuple[str, ...], has: Callable[[Key], bool]) -> dict[str, str]:
-    """Return the titles of the signals that an axis can play by its modes and objects; {} if it tells no position."""
+def signals_of(
+    modes: tuple[str, ...], has: Callable[[Key], bool], plays: Callable[[Key], bool] = lambda key: True
+) -> dict[str, str]:
+    """Return the titles of the signals that an axis can play; {} if it tells no position.
+
+    Args:
+        modes: Of its drive.
+        has: Whether the drive has an object.
+        plays: Whether it takes one with every cycle.
+    """
     if not (has((POSITION, 0)) and has((VELOCITY, 0))):
         return {}
-    return {name: one.title for name, one in SIGNALS.items() if one.mode in modes and has((one.target, 0))}
+    able = {name: one for name, one in SIGNALS.items() if one.mode in modes and has((one.target, 0))}
+    return {name: one.title for name, one in able.items() if plays((one.target, 0))}
 
 
 def course(settings: SignalSettings, cycle: float) -> Floats:

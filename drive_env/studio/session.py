@@ -27,6 +27,7 @@ from drive_env.dictionary.quantities import Scale
 from drive_env.drives import motion
 from drive_env.drives.emergency import EmergencyMessage
 from drive_env.drives.interface import Drives
+from drive_env.fieldbus.errors import NoAnswerError
 from drive_env.master.parameters import parameters
 from drive_env.master.single_axes import SingleAxes
 from drive_env.safety.errors import SafetyError
@@ -307,6 +308,15 @@ class Session:
         """The scales of each axis' units; empty before the drives are open."""
         return () if self._states is None else self._states.scales
 
+    def plays(self, key: Key) -> bool:
+        """Return whether the drives take an object with every cycle; not every process image has room for it."""
+        bus = None if self._real is None else self._real.bus
+        with contextlib.suppress(ObjectAccessError):
+            if bus is not None:
+                bus.link.process.check_played([self.description.dictionary.find(key)])
+            return True
+        return False
+
     def forget_faults(self, axis: int) -> None:
         """Note that the faults of an axis were reset."""
         if self._states is not None:
@@ -443,6 +453,7 @@ class Session:
             self._tell_stop(error)
         except Exception as error:  # a node that is gone: told, and tried again
             self._failed_at = time.monotonic()
+            states.lose(error.silent if isinstance(error, NoAnswerError) else ())
             told = sentence(error)
             if not self.events or self.events[-1].text != told:
                 self.say("error", told)

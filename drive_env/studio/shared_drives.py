@@ -170,6 +170,12 @@ class SharedDrives(DrivesProxy):
         with self.lock:
             self._drives.reset_node(where)
 
+    def start_node(self, where: Mask | None = None) -> None:
+        """Start nodes that have left operational."""
+        self._look()
+        with self.lock:
+            self._drives.start_node(where)
+
     def close(self) -> None:
         """Do nothing: the session closes its drives."""
 

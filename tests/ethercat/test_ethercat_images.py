@@ -304,6 +304,9 @@ class Segment:
     def map(self, sizes):
         self.log.append(("map", dict(sizes)))
 
+    def status(self, position):
+        return SimpleNamespace(is_op=position != 5)
+
     def operate(self, nodes, exchange, timeout):
         self.log.append(("operate", nodes, timeout))
         self.meanwhile = exchange
@@ -557,6 +560,7 @@ def test_samples_that_stay_out_are_told(bench, data):
     bench.master.rows = [ROW]
     samples = data.samples()
     data.exchange(is_cycle=True)
+    assert samples.missing(7, 0.25).silent == (1,)
     assert str(samples.missing(7, 0.25)) == (
         "1 input images came in 7 cycles, and no more within 0.25 s; check cable and power, and whether every drive is "
         "in Op"

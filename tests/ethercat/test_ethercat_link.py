@@ -182,7 +182,7 @@ def test_a_start_gives_images_and_goes_to_op_once(link, master):
     assert master.take() == []
     master.states[3] = SAFE_OP
     link.start()
-    assert master.take() == [("operate", (1, 3), False)]
+    assert master.take() == [("operate", (3,), False)]
 
 
 def test_a_slave_that_has_lost_its_images_gets_them_anew(link, master):

@@ -133,7 +133,7 @@ class Line:
     def welcome(self, node):
         self.log.append(("welcome", node))
 
-    def start(self):
+    def start(self, nodes=None):
         self.starts += 1
 
     def reset(self, nodes):

@@ -393,9 +393,9 @@ class MemoryLink:
     def welcome(self, node):
         pass
 
-    def start(self):
+    def start(self, nodes=None):
         with self.bus.turn:
-            for node in self.bus.nodes:
+            for node in self.bus.nodes if nodes is None else [self.bus.nodes[k] for k in nodes]:
                 if self.bus.is_connected:
                     node.enter(State.OP)
 

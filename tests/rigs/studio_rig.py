@@ -230,3 +230,18 @@ class Tab:
     def nameless(self):
         """Return the controls for which a screen reader has no words: a label, a text or an aria-label."""
         return self.driver.execute_script(NAMELESS)
+
+
+def choose(tab, name, text):
+    """Choose a row of a select."""
+
+    def row():
+        return next((one for one in tab.all(".q-menu .q-item") if one.text.startswith(text)), None)
+
+    def opened():
+        field = tab.named(name)
+        tab.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", field)
+        tab.driver.execute_script("arguments[0].closest('.q-field').querySelector('.q-field__control').click()", field)
+        return until(lambda: row() or "none", "its rows", 2.0) if not row() else row()
+
+    until(lambda: (found := opened()) != "none" and found, f"the choice {text}").click()

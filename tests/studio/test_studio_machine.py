@@ -59,19 +59,19 @@ def test_what_is_known_of_a_machine(session):
 
 
 def test_parameters_torque_and_supply_act(session):
-    do(session, machine_jobs.set_parameter("load.inertia", 2e-5))
-    do(session, machine_jobs.set_load_torque(0.01))
-    do(session, machine_jobs.set_supply(30.0))
+    do(session, machine_jobs.set_parameters({"load.inertia": 2e-5}))
+    do(session, machine_jobs.act("load_torque", 0.01))
+    do(session, machine_jobs.act("supply", 30.0))
     found = session.glimpse(
         lambda machine: (machine.parameters["load.inertia"][0], machine.load_torque[0], machine.supply[0])
     )
     assert found == pytest.approx((2e-5, 0.01, 30.0))
     with pytest.raises(ValueError, match="must be finite and 0 V or more"):
-        do(session, machine_jobs.set_supply(-1.0))
+        do(session, machine_jobs.act("supply", -1.0))
     with pytest.raises(ValueError):
-        do(session, machine_jobs.set_parameter("load.inertia", -1.0))
-    do(session, machine_jobs.set_load_torque(0.0))
-    do(session, machine_jobs.set_supply(24.0))
+        do(session, machine_jobs.set_parameters({"load.inertia": -1.0}))
+    do(session, machine_jobs.act("load_torque", 0.0))
+    do(session, machine_jobs.act("supply", 24.0))
     do(session, machine_jobs.set_parameters({"load.inertia": 1e-5}))
     assert session.glimpse(lambda machine: machine.parameters["load.inertia"][0]) == pytest.approx(1e-5)
 
@@ -84,8 +84,8 @@ def test_a_fault_that_is_switched_on_acts_and_one_that_is_ended_does_not(session
         (number, "supply_dip", True)
     ]
     assert session.glimpse(lambda machine: machine.supply[0]) == pytest.approx(5.0)
-    do(session, machine_jobs.end_fault(number))
-    do(session, machine_jobs.end_fault(number))  # it is over already
+    do(session, machine_jobs.end_faults("supply_dip"))
+    do(session, machine_jobs.end_faults("supply_dip"))  # it is over already
     do(session, lambda drives: drives.advance(0.1))
     assert session.glimpse(lambda machine: machine.supply[0]) == pytest.approx(24.0)
     do(session, motion_jobs.reset_fault(0))

@@ -18,7 +18,7 @@ from urllib.request import urlopen
 import pytest
 from rigs import ROOT, TESTS
 from rigs.namespaces import needs_namespaces, spaces, within  # noqa: F401
-from rigs.studio_rig import StudioProcess, Tab, chromium, needs_chromium, size_of, until
+from rigs.studio_rig import StudioProcess, Tab, choose, chromium, needs_chromium, size_of, until
 from rigs.truth import truth_of
 from selenium.webdriver.common.keys import Keys
 
@@ -181,21 +181,6 @@ def told(tab, name, words, patience=SOON):
         return until(lambda: words in text_of(tab, name) and text_of(tab, name), words, patience, SELDOM)
     except AssertionError:
         raise AssertionError(f"{name}: {text_of(tab, name)!r}, and not {words!r}; told: {tab.told()}") from None
-
-
-def choose(tab, name, text):
-    """Choose a row of a select."""
-
-    def row():
-        return next((one for one in tab.all(".q-menu .q-item") if one.text.startswith(text)), None)
-
-    def opened():
-        field = tab.named(name)
-        tab.driver.execute_script("arguments[0].scrollIntoView({block: 'center'})", field)
-        tab.driver.execute_script("arguments[0].closest('.q-field').querySelector('.q-field__control').click()", field)
-        return until(lambda: row() or "none", "its rows", 2.0) if not row() else row()
-
-    until(lambda: (found := opened()) != "none" and found, f"the choice {text}").click()
 
 
 def look(bench, page):

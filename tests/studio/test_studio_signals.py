@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
+import threading
+from contextlib import contextmanager
+from functools import partial
+
 import numpy as np
 import pytest
 from rigs.fault_injection import served
+from rigs.namespaces import needs_namespaces, spaces, within  # noqa: F401
 from rigs.session_rig import Beats, opened, until
+from rigs.studio_rig import Tab, choose, chromium, needs_chromium, studio
 
 from drive_env import EmulatedDrives, cia402
+from drive_env.ethercat.coe_node import CoeNode
+from drive_env.ethercat.ethercat_server import EtherCatServer
+from drive_env.ethercat.slave import EtherCatSlave
+from drive_env.ethercat.ways import RawSocket
+from drive_env.ethercat.world import EtherCatWorld
 from drive_env.fieldbus.description import describe
 from drive_env.firmware.common import fsa
 from drive_env.studio import motion_jobs, motion_signals
@@ -54,9 +65,9 @@ def inside(session, name):
     return float(session._real.inside.records[name].flat[0])
 
 
-def play(session, name, **settings):
+def play(session, name, axis=0, **settings):
     wanted = SignalSettings(name, **{"height": PEAKS[SIGNALS[name].target][0], **QUICK, **settings})
-    return session.do(play_signal(session, 0, wanted), name, page="page", paced=False).result(60)
+    return session.do(play_signal(session, axis, wanted), name, page="page", paced=False).result(60)
 
 
 # --- what is played -----------------------------------------------------------------------------------------------
@@ -230,3 +241,73 @@ def test_on_a_bus_the_envelope_holds_an_axis_to_its_room_and_has_its_limits_back
                 assert made._real.safety.limits == limits
         finally:
             made.close()
+
+
+@contextmanager
+def looked_at(drives, quantity):
+    """Yield the values that a quantity of axis 0 truly has, every few milliseconds while the block runs."""
+    seen, over = [], threading.Event()
+
+    def look():
+        while not over.wait(0.002):
+            seen.append(float(drives.inside.records[quantity].flat[0]))
+
+    watcher = threading.Thread(target=look)
+    watcher.start()
+    try:
+        yield seen
+    finally:
+        over.set()
+        watcher.join()
+
+
+def has_ended(drives, seen, low):
+    """Whether a signal has had its effect, and the axis is enabled in its mode of before."""
+    is_back = drives.read(cia402.MODE_DISPLAY)[0] == cia402.PP and drives.read(cia402.STATUSWORD)[0] & 0x6F == 0x27
+    return bool(seen) and is_back and np.abs(np.array(seen) - seen[0]).max() > low
+
+
+@needs_namespaces
+@needs_chromium
+@pytest.mark.slow
+def test_on_ethercat_the_page_plays_signals_beside_the_scope(spaces):  # noqa: F811
+    """A drive at one end of a cable, studio and browser at the other: what the rotor does is what the row says."""
+    pytest.importorskip("pysoem", reason="pysoem is not installed: pip install -e '.[ethercat]'")
+    drives = EmulatedDrives("tgz_s", "inertia", "am3033_e", num_threads=1)
+    drives.advance(0.002)  # compiled before time counts
+    drives.machine.reset()
+    world = EtherCatWorld()
+    world.add(EtherCatSlave(CoeNode(drives)), drives)
+    with within(spaces.slave):
+        way = RawSocket(spaces.slave_interface)
+    bus = ("--device", "tgz_s", "--interface", "ethercat", "--channel", spaces.master_interface, "--timeout", "20")
+    with EtherCatServer(world, way), within(spaces.master), studio(*bus) as made, chromium() as driver:
+        tab = Tab(driver, made).open("/scope")
+        for name in ("position_step", "position_sweep", "velocity_square", "current_square"):
+            height, quantity, low, high = PEAKS[SIGNALS[name].target]
+            choose(tab, "signal", SIGNALS[name].title)
+            tab.type("signal-height", height)
+            tab.type("signal-travel", "30 rev")
+            tab.press("enable")
+            tab.await_state("Operation enabled", 60.0)
+            with looked_at(drives, quantity) as seen:
+                tab.press("play-signal")
+                until(partial(has_ended, drives, seen, low), 60.0)
+            assert low <= np.abs(np.array(seen) - seen[0]).max() <= high, (name, tab.told())
+        titles = driver.execute_script("return document.body.innerText")
+        assert SIGNALS["load_step"].title not in titles, "no image of this drive has 60B2h"
+        assert tab.errors() == [] and "Traceback" not in made.output
+    world.close()
+
+
+def test_a_signal_of_one_axis_of_a_portal_leaves_the_others_where_they_hold():
+    with opened("portal") as session, Beats(session):
+        session.do(motion_jobs.enable((0, 1, 2), "pp"), "enable").result(20)
+        for axis in range(3):
+            before = session._real.machine.rotor_angle
+            first = session.recorder.ring.total
+            assert play(session, "position_step", axis=axis) == ""
+            place = session.recorder.ring.read(first, session.recorder.ring.total).values[cia402.POSITION_ACTUAL, 0]
+            moved = np.ptp(place, axis=0) / 65536.0 * 360.0
+            assert moved[axis] > 2.0 and np.delete(moved, axis).max() < 0.5, moved
+            assert np.abs(session._real.machine.rotor_angle - before).max() < 0.01 * REV

@@ -315,17 +315,20 @@ def test_a_fault_that_is_switched_on_acts_on_the_drive(tab):
     tab.press("enable")
     tab.await_state("Operation enabled")
     tab.open("/machine")
+    tab.driver.execute_script("arguments[0].click()", tab.one("[data-test=faults-supply] .q-item"))
     switch = "fault-supply_dip"
     tab.press(switch)
     tab.await_state("Fault", 10.0)
     until(
         lambda: "is-active" in tab.one(f".studio-fault-row:has([data-test={switch}])").get_attribute("class"), "its row"
     )
-    tab.press("end-faults")
+    until(lambda: "Should show: emergency FF00h" in tab.named("reaction-supply_dip").text, "what it should show")
+    until(lambda: "FF00h undervoltage; Fault" in tab.named("shows-supply_dip").text, "what the drive shows")
+    tab.press("step-supply_dip-end")
     until(lambda: not tab.all(".studio-fault-row.is-active"), "the end of the fault")
-    tab.open("/axes")
-    tab.press("reset")
+    tab.press("step-supply_dip-reset_fault")
     tab.await_state("Switch on disabled")
+    until(lambda: "no emergency; Switch on disabled" in tab.named("shows-supply_dip").text, "the end of the emergency")
 
 
 @pytest.mark.slow

@@ -104,9 +104,9 @@ class CanLink:
             client.check_alone()
             client.is_new = False
 
-    def start(self) -> None:
-        """Take the nodes to NMT operational."""
-        self._network.command(START)
+    def start(self, nodes: Sequence[int] | None = None) -> None:
+        """Take nodes to NMT operational, all of them for None."""
+        self._network.command(START, self.nodes if nodes is None else [self.nodes[k] for k in nodes])
 
     def reset(self, nodes: Sequence[int]) -> None:
         """Reset nodes (NMT reset node) and wait until they have booted.

@@ -61,10 +61,12 @@ class PdoSamples:
     def missing(self, rows: int, timeout: float) -> NoAnswerError:
         """Return the error for a TPDO that did not come."""
         pdo, frames = min(zip(self._pdos, self.frames, strict=True), key=lambda pair: len(pair[1]))
+        late = {pdo for pdo, frames in zip(self._pdos, self.frames, strict=True) if len(frames) < rows}
         return NoAnswerError(
             f"{pdo.label} ({pdo.can_id:03X}h) came {len(frames)} times for {rows} SYNCs, and no more within "
             f"{timeout:g} s; check that the node is operational and takes SYNC as {SYNC:03X}h (1005h), and the bus "
-            "load"
+            "load",
+            [k for k, of_node in enumerate(self._of_nodes) if not late.isdisjoint(of_node)],
         )
 
     def bytes_of(self, number: int, first: int, last: int) -> Bytes:

@@ -126,14 +126,18 @@ class EtherCatLink:
     def welcome(self, node: int) -> None:
         """Do nothing: the link has read a node's data from its EEPROM."""
 
-    def start(self) -> None:
-        """Take the nodes to Op; nodes that have lost their images get them anew.
+    def start(self, nodes: Sequence[int] | None = None) -> None:
+        """Take nodes to Op, for None all of them; nodes that have lost their images get them anew.
 
         Raises:
-            BusError: If one does not reach Op; NoAnswerError if it does not answer.
+            BusError: If one does not reach Op, or another one has lost its images; NoAnswerError if it does not answer.
         """
+        chosen = range(len(self.nodes)) if nodes is None else nodes
+        if others := [self.nodes[k] for k in self.process.missing if k not in chosen and nodes is not None]:
+            raise BusError(f"position {others[0]} has no images either, which go out in one frame; start all positions")
         with self.process.turn:
-            for k, position in enumerate(self.nodes):
+            for k in chosen:
+                position = self.nodes[k]
                 status = self._master.status(position)
                 if k in self.process.missing:
                     self._recover(k)
@@ -142,8 +146,8 @@ class EtherCatLink:
                     self._recover(k)
             if self.process.missing:
                 self.process.prepare()
-        if not all(self._master.status(position).is_op for position in self.nodes):
-            self.process.operate()
+        if waiting := tuple(self.nodes[k] for k in chosen if not self._master.status(self.nodes[k]).is_op):
+            self.process.operate(waiting)
 
     def reset(self, nodes: Sequence[int]) -> None:
         """Restart nodes by the reset sequence of their controllers (0040h), and wait until they are back.

@@ -66,7 +66,8 @@ class ImageSamples:
         """Return the error for samples of `rows` cycles that did not come within `timeout` [s]."""
         return NoAnswerError(
             f"{len(self.rows)} input images came in {rows} cycles, and no more within {timeout:g} s; check cable and "
-            "power, and whether every drive is in Op"
+            "power, and whether every drive is in Op",
+            self._data.out_of_op(),
         )
 
     def close(self) -> None:
@@ -153,6 +154,7 @@ class EtherCatProcessData:
     def check_played(self, entries: Sequence[Entry]) -> None:
         """Raise ObjectAccessError 06040041h for an object that cannot be sent with every cycle."""
         self._check(entries, OUTPUTS, "played")
+        self._planner.plan(OUTPUTS, entries, self._layout(OUTPUTS))
 
     def choose(
         self, wanted: Sequence[Entry], welcome: Sequence[Entry], played: Sequence[Entry] = ()
@@ -233,6 +235,16 @@ class EtherCatProcessData:
         """Slaves without the present mapping, by their number."""
         return [k for k in range(len(self._nodes)) if k not in self._ready]
 
+    def out_of_op(self) -> list[int]:
+        """Return the slaves that are not in Op, or do not answer, by their number; asked now."""
+        found = []
+        for k, position in enumerate(self._nodes):
+            with suppress(NoAnswerError):
+                if self._master.status(position).is_op:
+                    continue
+            found.append(k)
+        return found
+
     def prepare(self) -> None:
         """Set the images of the slaves in Pre-Op, filled with their objects' values, and take them to Safe-Op."""
         layouts = {direction: self._layout(direction) for direction in (OUTPUTS, INPUTS)}
@@ -247,10 +259,12 @@ class EtherCatProcessData:
         self._master.map(dict.fromkeys(self._nodes, sizes))
         self._ready = set(range(len(self._nodes)))
 
-    def operate(self) -> None:
-        """Take the slaves to Op."""
+    def operate(self, positions: Sequence[int] | None = None) -> None:
+        """Take slaves to Op, all of them for None."""
         exchange = None if self._lockstep else lambda: self.exchange(is_cycle=False)
-        self._master.operate(self._nodes, exchange and (lambda: _nothing(exchange())), LONGEST_STATE)
+        self._master.operate(
+            self._nodes if positions is None else positions, exchange and (lambda: _nothing(exchange())), LONGEST_STATE
+        )
         self.exchanged_at = time.monotonic()
 
     def leave(self) -> None:
