@@ -45,7 +45,7 @@ following error or by turns, nine constants; of Tracking eight pairs of gains on
 StepperRun eight speeds that are kept, of GainScheduling five constant sets of gains, the best of a search over 141
 among them, of GainTuning 26 constant sets); the *cascade* that a drive or a master has anyway, in a tuning with the
 gains that it is commissioned with; the *expert*, which is what a motion engineer would program who knows the
-parameters of each machine; and agents, trained as `drive-agent benchmark --seeds 3` trains them. Baselines and agents
+parameters of each machine; and agents, trained as `drive-agent benchmark` trains them, with as many seeds as the table says. Baselines and agents
 have the same 64 held-out episodes; the figure is the interquartile mean, of agents with its 95 % interval and with the
 mean, which sees rare failures. Agents see only what the drives tell. An agent ships where it is better than the expert
 with 95 % confidence, and the Ms of its loops is at most 2 on 32 drawn machines: it then answers following errors by
