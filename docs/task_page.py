@@ -45,14 +45,14 @@ following error or by turns, nine constants; of Tracking eight pairs of gains on
 StepperRun eight speeds that are kept, of GainScheduling five constant sets of gains, the best of a search over 141
 among them, of GainTuning 26 constant sets); the *cascade* that a drive or a master has anyway, in a tuning with the
 gains that it is commissioned with; the *expert*, which is what a motion engineer would program who knows the
-parameters of each machine; and agents, trained as `drive-agent benchmark` trains them, with as many seeds as the table says. Baselines and agents
-have the same 64 held-out episodes; the figure is the interquartile mean, of agents with its 95 % interval and with the
-mean, which sees rare failures. Agents see only what the drives tell. An agent ships where it is better than the expert
-with 95 % confidence, and the Ms of its loops is at most 2 on 32 drawn machines: it then answers following errors by
-less than it had learnt (`drive-agent margins agent.npz --dynamics standard --out calm.npz`), which costs some of its
-score. Where none ships, take the expert. Of StepperRun none can ship: under a push of 1 % of the rated torque the
-rotor swings in its field with an Ms of 6 in the median of 24 machines, and every sixth loses its steps with the expert,
-every fourth with an agent, since near the highest speed no torque is left.
+parameters of each machine; and agents, trained as `drive-agent benchmark` trains them, with as many seeds as the table
+says. Baselines and agents have the same 64 held-out episodes; the figure is the interquartile mean, of agents with its
+95 % interval and with the mean, which sees rare failures. Agents see only what the drives tell. An agent ships where
+it is better than the expert with 95 % confidence, and the Ms of its loops is at most 2 on 32 drawn machines: it then
+answers following errors by less than it had learnt (`drive-agent margins agent.npz --dynamics standard --out
+calm.npz`), which costs some of its score. Where none ships, take the expert. Of StepperRun none can ship: under a push
+of 1 % of the rated torque the rotor swings in its field with an Ms of 6 in the median of 24 machines, and every sixth
+loses its steps with the expert, every fourth with an agent, since near the highest speed no torque is left.
 
 """
 
