@@ -6,6 +6,7 @@ A coarser grid than `drive-tune sweep`'s, so that it takes seconds.
 """
 
 import argparse
+import math
 from dataclasses import dataclass, replace
 
 from drive_env.motors import MOTORS
@@ -31,7 +32,8 @@ def main(arguments: Arguments) -> None:
                 f"{name} = {row[name]:.4g}" for name in (*result.objects, "score [s]", "settling [s]", "dip [rpm]")
             )
         )
-    print(f"{result.usable.sum()} of {len(result.order)} points are usable")
+    usable = int((result.score < math.inf).sum())
+    print(f"{usable} of {len(result.order)} points are usable")
     if arguments.out:
         print(f"written to {save_sweep(result, arguments.out)}")
 

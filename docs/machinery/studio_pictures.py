@@ -163,7 +163,7 @@ SHOTS = (
     Shot("runs", "/runs", 1280, 960, False, nothing),
     Shot("axes-phone", "/axes", 360, 780, True, nothing),
     Shot("commission", "/commission", 1280, 1500, False, commission),
-    Shot("machine", "/machine", 1280, 1400, False, fail),
+    Shot("machine", "/machine", 1280, 1750, False, fail),
 )
 
 

@@ -146,7 +146,7 @@ class Wire:
         return max(self._free_at, min(c.queue[0].ready for c in self._senders.values() if c.queue))
 
     def take(self, until: float) -> Transmission | None:
-        """Return the next transmission that ends at `until` [s] or before, None if there is none.
+        """Return the next transmission that ends at `until` [s] or before, None if every one ends later.
 
         Arbitration is decided only when the bus is free, so call it with the present time, not a future one.
         """

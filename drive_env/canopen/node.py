@@ -222,7 +222,7 @@ class Node:
 
     @property
     def next_answer(self) -> float:
-        """Time of its next SDO answer, or segment of one [s]; inf if there is none."""
+        """Time of its next SDO answer, or segment of one [s]; inf if no answer is due."""
         return min(self._answers[0][0], self._segment_at) if self._answers else self._segment_at
 
     def answer(self, now: float) -> None:

@@ -208,7 +208,7 @@ def _without_remote_frames(entry: Entry, wanted: list[Any], found: list[Any]) ->
 
 
 def _live(drives: BusDrives) -> str:
-    """Return the axes that are enabled by their present statuswords, as text; "" if there are none."""
+    """Return the axes that are enabled by their present statuswords, as text; "" if all are off."""
     status = [int(word) for word in drives.read(cia402.STATUSWORD)]
     return ", ".join(
         f"{axis_name(drives, axis)} ({word:04X}h)" for axis, word in enumerate(status) if cia402.is_live(word)

@@ -60,7 +60,7 @@ class MoveOutcome(NamedTuple):
         end: Position after the axis was switched off [inc]; 0 if the drive has no position.
         reasons: Why the movement was stopped; [] if it was not.
         emergencies: Those of the axis, as their fields.
-        trace: The requested samples; None if there are none.
+        trace: The requested samples; None if nothing was recorded.
     """
 
     status: int

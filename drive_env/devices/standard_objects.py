@@ -35,7 +35,7 @@ class OwnObject(NamedTuple):
         why: What the EDS lacks.
         role: Its role; "" if it has none.
         modes: Modes of operation that need it; empty: every drive needs it.
-        unless: A field that serves the same purpose if an object has it; "" if there is none.
+        unless: A field that serves the same purpose if an object has it; "" if no field does.
     """
 
     name: str

@@ -240,7 +240,7 @@ def axis_number(drives: BasicDrives, axis: int) -> int:
 
 
 def machine_of(drives: Drives) -> MachineSide:
-    """Return the emulated machines behind drives; ValueError if there are none."""
+    """Return the emulated machines behind drives; ValueError for drives without a machine in this process."""
     if drives.machine is None:
         raise ValueError("these drives have no emulated machine; use EmulatedDrives")
     return drives.machine

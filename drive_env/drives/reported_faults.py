@@ -77,7 +77,7 @@ def _named(
 
 
 def _newest(drives: Drives, known: Description, axis: int) -> int:
-    """Return the newest entry of 1003h for an axis; 0 if there is none.
+    """Return the newest entry of 1003h for an axis; 0 if 1003h has no entry of it.
 
     A known device has the axis in bits 16 to 23; for other drives these bits are maker-specific (CiA 301).
     """

@@ -237,7 +237,7 @@ class MasterWatch(Protocol):
         """Forget the watchdog's previous settings: the node was reset."""
 
     def take_rival(self) -> str:
-        """Return, once, the other program that keeps the nodes from noticing this one's death; "" if there is none."""
+        """Return, once, the other program that hides this one's death from the nodes; "" if none does."""
 
 
 class OtherMastersHeard(Protocol):

@@ -60,7 +60,7 @@ class SdoServer:
         longest_text: Longest string or domain that can be written [bytes]; 0: not writable.
 
     Attributes:
-        block: The open block transfer; None if there is none.
+        block: The open block transfer; None between transfers.
     """
 
     def __init__(
@@ -124,7 +124,7 @@ class SdoServer:
         return segment
 
     def expire(self, now: float) -> bytes | None:
-        """Return the abort of a transfer whose client has been silent for too long; None if there is none."""
+        """Return the abort of a transfer whose client has been silent for too long; None if no client was."""
         if self.block is not None:
             if now - self._last < self._timeout - EPSILON:
                 return None

@@ -89,7 +89,7 @@ class Watchdogs:
         self._watch.forget(node)
 
     def take_rival(self) -> str:
-        """Return, once, the program that keeps the drives from noticing this one's death; "" if there is none."""
+        """Return, once, the program that keeps the drives from noticing this one's death; "" if no program does."""
         return self._watch.take_rival()
 
     def set(self) -> None:

@@ -476,7 +476,7 @@ def test_a_sweep_of_the_pid_measures_no_current_and_says_so(tmp_path):
     result = run(load_experiment(tmp_path / "out" / "settings.toml"), num_threads=1)
     assert result.objects == ("202Bh:00", "202Ch:00")
     assert not {"ripple [A]", "peak_current [A]", "rms_current [A]"} & result.columns.keys()
-    usable = result.usable.reshape(3, 2)
+    usable = (result.score < np.inf).reshape(3, 2)
     assert usable[:2].all() and not usable[2].any(), "P = 32000 makes the rotor swing in its field"
     behind = result.columns["behind [s]"].reshape(3, 2)
     assert behind[0, 1] < 0.8 * behind[0, 0], "the I part takes away what the load turns the rotor by"

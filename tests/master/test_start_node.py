@@ -107,7 +107,7 @@ def on_can(two):
     world = World(lockstep=True)
     world.add(two, [1, 2])
     bus = WorldBus(world)
-    with CanDrives(bus=bus, nodes=[1, 2], pace="lockstep") as drives:
+    with CanDrives(bus=bus, nodes=[1, 2], pace="lockstep", timeout=0.2) as drives:
         yield drives, lambda command, node: world.receive(Frame(0x000, bytes((command, node)))), lambda: states(world)
     world.close()
 
@@ -144,14 +144,15 @@ def test_an_axis_of_another_node_turns_on_meanwhile(on_can, two):
 
 def test_a_node_with_an_axis_that_was_not_proved_off_is_not_started(on_can):
     drives, command, now = on_can
+    command(0x02, 1)
     command(0x02, 2)
     drives.safety._axes.lost.add(0)
     with pytest.raises(SafetyError, match="axis 0 could not be confirmed to be off"):
         drives.start_node()
     drives.safety._axes.lost.clear()
-    assert now()[1] is NmtState.STOPPED
+    assert now() == [NmtState.STOPPED] * 2
     ChosenAxes(drives, [1]).start_node()
-    assert now()[1] is NmtState.OPERATIONAL
+    assert now() == [NmtState.STOPPED, NmtState.OPERATIONAL]
 
 
 @pytest.mark.parametrize("state", [AlState.SAFE_OP, AlState.PRE_OP], ids=lambda one: one.name)

@@ -32,6 +32,7 @@ from drive_env.bus.hub import Hub
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
 from drive_env.canopen.frames import Frame
+from drive_env.canopen.nmt import Command
 from drive_env.cia402 import State
 from drive_env.dictionary import entries
 from drive_env.fieldbus import description
@@ -402,6 +403,20 @@ def gain_trial(drives):
     motion.disable(drives)
 
 
+def restarted_node(drives):
+    """A node is stopped under an axis that has turned and is off, as by another master; it is started, and moves."""
+    motion.enable(drives, mode="pv")
+    drives.write("Target velocity", 10 * TURN)
+    drives.advance(0.02)
+    stop_by_ramp(drives)
+    drives.link.port.send(0x000, bytes((Command.STOP, drives.nodes[0])))
+    drives.start_node()
+    motion.enable(drives, mode="pp")
+    motion.start_move(drives, TURN // 16)
+    drives.advance(0.02)
+    stop_by_ramp(drives)
+
+
 def stop_by_ramp(drives):
     motion.quick_stop(drives)
     for _ in range(100):
@@ -424,7 +439,7 @@ def run_on(drives):
 
 
 SESSIONS: dict[str, Callable[[CanDrives], None]] = {
-    session.__name__: session for session in (pp_move, pv_run, csp_play, cst_play, gain_trial)
+    session.__name__: session for session in (pp_move, pv_run, csp_play, cst_play, gain_trial, restarted_node)
 }
 
 

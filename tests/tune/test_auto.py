@@ -33,7 +33,7 @@ from tuning.auto import identified as auto_identified
 from tuning.auto import one_button as auto_module
 from tuning.auto import trying as auto_trying
 from tuning.auto.certify import SETTLING, certificate
-from tuning.auto.checks import unsafe_gains
+from tuning.auto.identified import unsafe_gains
 from tuning.auto.loop_margins import MS_ERROR
 from tuning.auto.one_button import BUDGET, Method, auto
 from tuning.auto.proving import ProvingGround

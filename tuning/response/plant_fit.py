@@ -54,10 +54,10 @@ PAIR = ("anti_resonance", "resonance", "damping")
 DAMPED = {"anti_resonance": 0.03, "resonance": 0.03, "damping": 0.0}  # share of the damping that may move a pair
 ABOUT = 1.1  # of a pair: how far the lines go that tell it when it lies close together
 SECONDS, SPACING = 6, 0.25  # beginnings that are tried for a second pair, and their distance, a logarithm
-RATIOS = (1.08, 1.15, 1.4, 1.8, 2.6)  # of a second resonance over its anti-resonance, where the search begins
+RATIOS = (1.15, 1.4, 1.8, 2.6)  # of a resonance over its anti-resonance, where the search begins
 # Where the search for a pair begins: the cheapest of those about the deepest swing, between the lines to either side of
-# its ends, since a lightly damped pair is found from nearby alone.
-BETWEEN, DAMPINGS, BEGINNINGS = 7, (0.005, 0.02, 0.08), 5
+# its ends, and of a grid over all frequencies. A lightly damped pair is found from nearby alone.
+BETWEEN, DAMPINGS, LOWS, BEGINNINGS = 7, (0.005, 0.02, 0.08), 16, 5
 GOOD_MISFIT = 2.0  # of a fit by which margins may be read between lines
 RIGID_ENOUGH = 1.5  # misfit up to which no further resonance is looked for
 NAMES = ("inertia", "velocity_filter", "loop_delay", "anti_resonance", "resonance", "damping")
@@ -382,7 +382,7 @@ def _with_inertia(plant: Plant, device: Device, gains: Integers, f: Floats, roug
 
 
 def _candidate_pairs(loop: _Loop, rough: Complex, rigid: Plant) -> list[Plant]:
-    """Return plants with a pair to begin with, the cheapest of those about the deepest swing of the response."""
+    """Return plants with a pair to begin with: about the deepest swing of the response, and of a coarse grid."""
     device, gains, f = loop.device, loop.gains, loop.f
     level = 20.0 * np.log10(np.abs(rough / velocity_plant(device, rigid, gains, f)))
     pairs = []
@@ -402,7 +402,10 @@ def _candidate_pairs(loop: _Loop, rough: Complex, rigid: Plant) -> list[Plant]:
         for a, b, damping in product(between, between, DAMPINGS)
         if f[0] <= valley_hz + a < peak_hz + b
     ]
-    return sorted(near, key=lambda plant: _cost(loop, _Model(plant)))[:BEGINNINGS]
+    grid = [scaled(low, low * ratio, 0.03) for low in np.geomspace(f[0], f[-1] * 0.8, LOWS) for ratio in RATIOS]
+    return [
+        one for some in (near, grid) for one in sorted(some, key=lambda plant: _cost(loop, _Model(plant)))[:BEGINNINGS]
+    ]
 
 
 def _candidate_seconds(loop: _Loop, ones: list[_Solution]) -> list[_Model]:
@@ -411,7 +414,7 @@ def _candidate_seconds(loop: _Loop, ones: list[_Solution]) -> list[_Model]:
     for plant in {round(one.model.plant.resonance): one.model.plant for one in ones}.values():
         mine = Pair(plant.anti_resonance, plant.resonance, min(plant.damping, 0.05))
         for low in np.geomspace(2.0 * loop.f[0], loop.f[-1] * 0.9, 24):
-            for ratio in RATIOS:
+            for ratio in (1.08, *RATIOS):
                 first, second = sorted((mine, Pair(float(low), float(low * ratio), 0.03)))
                 models.append(_Model(replace(plant, **first._asdict()), second))
     # Of two springs in a row the first resonance lies below the second anti-resonance.

@@ -344,7 +344,7 @@ class ErrorControls:
         self._controls[node].forget()
 
     def take_rival(self) -> str:
-        """Return, once, the other program that sends heartbeats under our node-ID; "" if there is none."""
+        """Return, once, the other program that sends heartbeats under our node-ID; "" if no other program does."""
         if not self._heartbeats.is_shared or self._beats is None:
             return ""
         node, self._heartbeats.node_id = self._heartbeats.node_id, 0  # another one at the next enabling

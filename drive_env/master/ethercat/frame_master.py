@@ -182,7 +182,7 @@ class FrameMaster:
         return SlaveStatus(0, False, 0) if data is None else _status(data)
 
     def _count(self) -> int:
-        """Return the number of slaves; NoAnswerError if there are none."""
+        """Return the number of slaves; NoAnswerError if no slave answers."""
         for _ in range(TRIES):
             found = self._one(C.BRD, 0, registers.AL_STATUS, bytes(2))
             if found is not None and found.counter:

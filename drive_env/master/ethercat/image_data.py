@@ -388,7 +388,7 @@ class EtherCatProcessData:
         return self._enabled_axis() is not None
 
     def _enabled_axis(self) -> int | None:
-        """Return the first axis that is enabled; None if there is none, or no slave has its images."""
+        """Return the first axis that is enabled; None if all axes are off or no slave has its images."""
         if not self._ready:
             return None
         status = self._description.dictionary.find((cia402.STATUSWORD, 0))
