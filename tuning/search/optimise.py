@@ -440,7 +440,7 @@ class _Search:
 
     # --- the safe search ----------------------------------------------------------------------------------------------
     def _prove(self) -> None:
-        """Try the safe gains first, then slower ones if they fail; end the search of a machine that still oscillates."""
+        """Try the safe gains first, then slower ones; end the search of a machine that oscillates with all of them."""
         searches = [k for k in range(len(self._members)) if not self._proved[k]]
         point = {k: self._start[k] for k in searches}
         for _ in range(SAFE_STARTS):

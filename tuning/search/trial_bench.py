@@ -217,9 +217,7 @@ class TrialBench:
         # These gains stay until the next trial, instead of the probe's.
         write_gains(target.drives, np.where(self._fallback.calmed[:, None], self.safe, self.incumbent), axes)
         self._trials.recover(axes)
-        if not (
-            self._anew or self._trials.returns
-        ):  # the next trial goes back from the end of this move
+        if not (self._anew or self._trials.returns):  # the next trial goes back from the end of this move
             self._origin = np.where(axes, self._origin + self._direction * self.move.distance, self._origin)
             self._direction = np.where(axes, -self._direction, self._direction)
         self.moves[axes] += MOVES_OF_TRIAL
