@@ -166,7 +166,7 @@ class MeasuredLoop:
         )  # fmt: skip
 
     def at_least(self, loop: str, gains: Sequence[int] | Integers, axis: int = 0) -> AtLeast:
-        """Return lower bounds of a loop's margins, from models drawn within the fit's intervals; nan without a good fit.
+        """Return lower bounds of a loop's margins, from models drawn within the fit; nan without a good fit.
 
         Args:
             loop: "velocity" or "position".
