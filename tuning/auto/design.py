@@ -109,7 +109,7 @@ def _known(bench: AutoBench, basis: Basis, recorded: RecordedGains | None, k: in
     """Return the data of an axis' twin: as identified, or as its response was fitted if that was measured.
 
     For an axis that was not at rest the dry friction is reduced: moves overestimate it, since drag looks like dry
-        friction.
+    friction.
     """
     plant, found = basis.identified.known(k)
     reach = float(basis.trial_reach(bench)[k])
@@ -248,7 +248,7 @@ def design_by_loops(
     """Return the most promising gains that keep the constraints of the loops, (count,), and their slack.
 
     It takes seconds, since no twin runs: friction and noise are ignored, and the current loop has the crossover that
-        its lags allow.
+    its lags allow.
 
     Args:
         device: The drive.

@@ -117,7 +117,7 @@ def measured_axis(bench: AutoBench, basis: Basis, recorded: RecordedGains, k: in
     """Return the measured loops of an axis; None if they were not measured.
 
     Linked axes are judged by the responses from their identification, each with the other axis off: gains that are good
-        for both may oscillate with one alone.
+    for both may oscillate with one alone.
     """
     target = bench.target
     if target.linked:

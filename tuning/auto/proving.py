@@ -280,9 +280,9 @@ class ProvingGround:
         """Return the overshoot of a csp set-point step, there and back, over the step, (num_axes,).
 
         The step is STEP_SIZE counts of an encoder with 4096 counts, or of a coarser one of the motor: small enough for
-            the loops to stay linear, and large enough for friction and noise not to matter. A first step, there and
-            back, is not counted: it releases what dry friction has stored in the integrator. Linked axes step together.
-            The step tests the loops only: feed-forward, which would respond to the step itself, is off during it.
+        the loops to stay linear, and large enough for friction and noise not to matter. A first step, there and back,
+        is not counted: it releases what dry friction has stored in the integrator. Linked axes step together. The step
+        tests the loops only: feed-forward, which would respond to the step itself, is off during it.
         """
         drives, where = self.target.drives, self.target.together(where)
         self._fallback.begin()

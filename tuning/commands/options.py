@@ -314,7 +314,7 @@ def check_no_bus(nodes: list[int] | None, bitrate: int | None, lockstep: bool, a
     """Raise ValueError for options of a bus without --bus.
 
     Interface and channel may come from the environment: alone they do not select the bus, so that no motor turns
-        unexpectedly.
+    unexpectedly.
     """
     if nodes or bitrate is not None or lockstep:
         raise ValueError("--node, --bitrate and --lockstep are for drives on a bus; add --bus, or leave them out")

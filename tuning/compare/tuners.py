@@ -106,7 +106,7 @@ class RuleTuner:
     """A rule of `tuning.rules.rules_by_name` as a tuner: identify, compute, write.
 
     The identification does not depend on the rule: for several rules on the same machines, identify once and call
-        `propose` of each.
+    `propose` of each.
     """
 
     def __init__(self, name: str) -> None:

@@ -56,7 +56,7 @@ def modulus_rule(device: Device, motor: Motor, plant: Plant) -> Proposal:
     """Propose the modulus optimum for all three loops.
 
     The velocity loop of an axis without viscous friction has no lag to cancel: it then gets no integral part, and a
-        constant load leaves a steady error.
+    constant load leaves a steady error.
     """
     bench = Workbench(device, plant)
     lag = take_current(bench, device, plant)

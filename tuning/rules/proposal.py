@@ -37,7 +37,7 @@ class Workbench:
     """Converts a rule's controllers to integers, the inner loops first, and returns each rounded gain in SI units.
 
     A rule designs a loop, rounds its gains here, and designs the next loop around the rounded one: integration time and
-        outer loop follow the bandwidth that was reached, not the wanted one.
+    outer loop follow the bandwidth that was reached, not the wanted one.
 
     Loop names are "current", "velocity" and "position", as in a device's gain set.
 

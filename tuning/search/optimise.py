@@ -228,7 +228,7 @@ class _Search:
     """Simultaneous searches on the machines of a bench; a point is the logarithms of gains over the rule's.
 
     All axes of a machine use the same factors: the rule already adapts to the axes, and a search of three numbers
-        succeeds in twenty trials where one of eighteen numbers does not.
+    succeeds in twenty trials where one of eighteen numbers does not.
     """
 
     def __init__(
