@@ -45,7 +45,7 @@ def _dictionary(device: str) -> ObjectDictionary:
 
 
 class DriveAudit(Observer):
-    """Counts a tuner's time, moves and violations, and hides the machine.
+    """Counts a tuner's time, moves and violations, and hides the emulated machine from the tuner.
 
     Args:
         target: The target to be tuned.

@@ -161,7 +161,7 @@ class Target:
         return self
 
     def __exit__(self, *error: Any) -> None:
-        # The drives' own exit, not close(): on a bus an exception stops the axes first.
+        # Not close(): the exit of drives on a bus also stops the axes if there is an exception.
         self.drives.__exit__(*error)
 
 

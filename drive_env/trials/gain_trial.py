@@ -328,7 +328,7 @@ def momentum_balance(
     speed, would be mistaken for friction on an oscillating axis.
     With a known inertia [kg m^2], (num_axes,), the viscous friction is the motor's, and only dry friction is fitted: in
     a short move the two cannot be separated. `moving`, as long as `speed`, selects the samples that count, all by
-    default: at rest dry friction can hold any load up to its own value, which must not be taken for a constant load.
+    default: at rest dry friction can hold any load up to its own value, which must not count as a constant load.
     """
     sign = np.clip(speed / STANDSTILL, -1.0, 1.0)
     rate = np.gradient(angle, CYCLE, axis=0)

@@ -27,7 +27,7 @@ LIFT = 16  # steps by which the threshold is raised if the reading is 0
 
 
 def lacks_load_detection(device: Device) -> str:
-    """Return what a device lacks for adjustable load detection; "" if nothing."""
+    """List the parts that a device lacks for adjustable load detection as text; "" if it lacks none."""
     if device.gains.column(*THRESHOLD) is None:
         return "its gains.toml has no threshold of a load detection"
     missing = [role.value for role in (Role.LOAD_VALUE, Role.STALL_SPEED) if role not in device.roles]

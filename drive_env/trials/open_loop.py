@@ -312,7 +312,7 @@ class OpenLoopTrials(Trials):
         start(self._drives, wrapped(target + self.shift()).astype(np.int64), where)
 
     def identify(self, reach: Floats, where: Mask) -> tuple[Identified, Integers]:
-        """Move there and back with the present currents; return the axes by their load angles, and their starts [inc].
+        """Identify axes by their load angles in moves there and back with the present currents; return starts [inc].
 
         The inertia is unknown: an axis that loses steps in moves for a light load repeats them more slowly, while the
         others stand.

@@ -62,7 +62,6 @@ def load_step_error(device: Device, motor: Motor, loop: ClosedLoop, gains: Integ
 
     The field is an integrator, and a load of 0.3 of the rated torque immediately turns the rotor in it by e (TMC4361
     data sheet; f is the clock, div 256 if 202Eh is 0):
-    sheet; f is the clock, div 256 where 202Eh is 0):
 
         de/dt (1 + 2021h 128 div / f) = -(202Bh / 256 e + 202Ch f / 2^23 int e), at most 202Fh
 

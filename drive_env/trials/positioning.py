@@ -104,7 +104,6 @@ def longer_way(low: ArrayLike, high: ArrayLike) -> Floats:
 
     So axes of a machine near the middle of their travel always move in the same direction: the load of a joint depends
     on the directions of the others in its arm.
-    pushes depends on which way the others of its arm go.
 
     Args:
         low: Signed angle that they may turn backwards, at most 0.

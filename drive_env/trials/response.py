@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mechanics.arrays import Floats, Integers, Mask
 
-ROUNDING = 1e-9  # of the record: t = k * dt may miss a given time by this without costing a sample
+ROUNDING = 1e-9  # of the record: a sample may lie outside a time limit by this, since t = k * dt is rounded
 
 # Oscillation, see `oscillation`; the first three in units of the amplitude to be found.
 SWING = 1.3  # a sine sampled four times per period shows 1.41 to 2 amplitudes from valley to peak
@@ -247,7 +247,7 @@ def oscillation(t: ArrayLike, x: ArrayLike, *, amplitude: ArrayLike) -> tuple[Ma
     2. its swing is at least 0.8 amplitudes and half the early one (not decaying),
     3. x reverses at least three times in the record, by 1.3 amplitudes each time (not one overshoot).
     The record needs 3.5 periods for a reliable result: 5 Hz needs 0.7 s, and 0.15 s is enough from 23 Hz; with fewer
-    periods ringing may be taken for a transient. At 1 kHz it works up to 450 Hz. Decaying and steady ringing are
+    periods ringing may be mistaken for a transient. At 1 kHz it works up to 450 Hz. Decaying and steady ringing are
     distinguished after 2.3 periods with a damping of 0.2 to 0.35, after 4 with 0.1. Noise must stay below 0.2
     amplitudes rms. The frequency is the highest line of the Hann spectrum, for evenly spaced samples.
 

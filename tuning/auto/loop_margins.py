@@ -218,7 +218,7 @@ def _tell_variants(
     for dynamics, tell in ((bench.dynamics, journal.reserve), (find_dynamics("stiff"), journal.stop)):
         every = model.kept(dynamics, gains)
         if isinstance(measured, MeasuredAxis):
-            # The model of coupled axes also tells what happens if the velocity P of all of them changes.
+            # The model of coupled axes also covers a change of the velocity P of all of them.
             told = measured.kept(dynamics, own)
             every |= {name: min(kept, every.get(name, kept)) for name, kept in told.items()}
         name, kept = min(every.items(), key=lambda one: one[1])

@@ -73,7 +73,6 @@ def write_limits(target: Target, wanted: Mapping[str, str], *, places: bool) -> 
 
     Raises:
         ValueError: For a limit that the drive does not have, or an unsuitable text; nothing is written then.
-            written.
     """
     drives = target.drives
     scales = quantities.scales_of(drives, target.device.new_dictionary())

@@ -37,7 +37,7 @@ MARGIN = 0.1  # rad of room that is not used
 TOLERANCE = 0.35  # of a pole pair: a larger deviation from a whole number is rejected
 STUCK = 0.25  # of the field's turn: a rotor that moves less does not follow
 # Of a brushed motor: current (as a share) and cycles of a quarter of the pulse; counts that must be seen, and least
-# correlation with the pulse, by which falling and coasting are told apart.
+# correlation with the pulse, which an axis that falls or coasts does not reach.
 PUSHES = ((0.5, 4), (0.5, 8), (SHARE, 16), (SHARE, 32), (SHARE, 64))
 LEAST_COUNTS, LIKENESS = 10, 0.7
 PULSED = 1.2  # of the current limit, RMS over 25 ms: above, the current loop oscillates

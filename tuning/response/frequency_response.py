@@ -52,7 +52,7 @@ BUS_LIMIT = 400.0  # Hz; above, samples of a bus contain more of the images than
 TRACED_TOP = 495.0  # Hz, greatest frequency of the set-points in a traced measurement
 TRACE_LIMIT = 1000.0  # Hz
 PASSES, PERIODS = 2, 3  # of a measurement; the trial before it has one of each
-SOFTER = 2  # how often the gains of an axis that oscillates are lowered
+SOFTER = 2  # how many times the gains of an axis that oscillates are lowered
 CONFIRMING, LESS = 6, 0.5  # passes if confirmed, and share of the excitation in their second half
 
 

@@ -151,7 +151,7 @@ def found_in(value: Any, folder: Path) -> Any:
 
 def write_inputs(folder: Path, inputs: Iterable[Input]) -> None:
     """Write inputs into a run's folder; raises OSError with the file and the reason."""
-    from drive_env.whole_file import write_whole  # not with the module: acting with an agent's file needs NumPy alone
+    from drive_env.whole_file import write_whole  # here, since acting with an agent's file needs NumPy only
 
     for one in inputs:
         for name, content in one.files.items():
