@@ -1,4 +1,4 @@
-"""A whole run of auto that leaves its files in a folder: the state before, the certificate, the report."""
+"""Runs auto, or the commissioning of a stepper, with all files in one folder: state before, certificate, report."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ def auto_to_files(
     dynamics: str | Dynamics = DEFAULT,
     method: Method | None = None,
 ) -> Result:
-    """Tune axes with closed loops; before.toml, certificate.json and report.html are in the folder afterwards.
+    """Tune axes with closed loops and write before.toml, certificate.json and report.html into the folder.
 
     Args:
         target: The drives, as `tuning.auto.one_button.auto` takes them.
-        folder: New or empty.
-        progress: Called with the present step and the share done.
-        seed: Of the emulated machine, for the certificate.
-        keep: Whether drives on a bus store the gains.
-        dynamics: What the loops must keep.
-        method: How gains are found; None is auto's own design.
+        folder: A new or empty folder.
+        progress: Called with the name of the present step and the share of the run that is done, 0 to 1.
+        seed: Seed of the emulated machine, recorded in the certificate.
+        keep: Whether drives on a bus store the gains over a power cycle.
+        dynamics: Requirements on the loops.
+        method: How gains are found; None selects auto's own design.
 
     Raises:
         BusError, OSError: As `auto` does.
@@ -56,10 +56,10 @@ def auto_to_files(
 
 
 def commission_to_files(target: Target, folder: Path, progress: Progress, *, keep: bool = True) -> StepperResult:
-    """Commission open-loop steppers; before.toml and stepper-certificate.json are in the folder afterwards.
+    """Commission open-loop steppers and write before.toml and stepper-certificate.json into the folder.
 
     Raises:
-        ValueError: For a drive without load detection, before anything is done; else as `commission`.
+        ValueError: If the drive has no load detection (checked before anything is written); else as `commission`.
     """
     from tuning.search.trial_bench import leave_oscillations_to_trials
     from tuning.stepper.commissioning import check_stepper, commission

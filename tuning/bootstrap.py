@@ -1,4 +1,4 @@
-"""95 % intervals by the percentile bootstrap: machines or episodes drawn anew, as many as there are."""
+"""95 % confidence intervals by the percentile bootstrap: machines or episodes are resampled with replacement."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ ENDS = (0.025, 0.975)
 
 
 def bootstrap_interval(statistic: Callable[..., Any], *samples: Floats, paired: bool = True) -> tuple[float, float]:
-    """Return the ends of a statistic's interval: of its values on samples drawn anew, with replacement.
+    """Return the ends of the 95 % confidence interval of a statistic by the percentile bootstrap.
 
-    The draws are the same every time: figures in cards and tables do not change where nothing else has.
+    The random draws are fixed: figures in cards and tables change only if the data change.
 
     Args:
-        statistic: Takes each sample drawn anew, shape (RESAMPLES, n), and returns a value for each draw; a draw on
-            which it is undefined may be left out.
-        samples: One or several, shape (n,), none of them empty.
-        paired: Whether entry k of one sample belongs to entry k of the others: then they are drawn together.
+        statistic: Takes each resampled sample, shape (RESAMPLES, n), and returns one value per resample; it may leave
+            out resamples for which it is undefined.
+        samples: One or several non-empty samples, shape (n,).
+        paired: Whether entry k of one sample belongs to entry k of the others: then they are resampled together.
     """
     rng = np.random.default_rng(0)
     if paired:

@@ -1,6 +1,6 @@
 """An audit of a tuner's use of drives: time, moves, and violations of their limits.
 
-A tuner is compared by what it did, not by what it says: the audit stands between it and the drives, and it hides the
+Tuners are compared by these counts, not by their own statements: the audit is between tuner and drives, and hides the
 emulated machine behind them.
 """
 
@@ -31,30 +31,30 @@ if TYPE_CHECKING:
     from drive_env.dictionary.entries import Entry
 
 
-# What counts as a violation, each time anew that it begins:
+# Violations; each is counted once, when it begins.
 OVERSPEED = 1.2  # times the target's limit of speed
-BLOCK, SHAKING_BLOCKS = 25, 4  # [cycles]: an oscillation that has not been stopped after 100 ms
-SLACK = 0.02  # rev beyond the travel that do not count yet: a few counts of an overshoot at its end
+BLOCK, SHAKING_BLOCKS = 25, 4  # [cycles]: an oscillation that was not stopped within 100 ms
+SLACK = 0.02  # rev beyond the travel that are not yet a violation: a few counts of overshoot at its end
 KINDS = ("left its travel", "too fast", "oscillated", "tripped")
 
 
 @cache
 def _dictionary(device: str) -> ObjectDictionary:
-    """Return the object dictionary of a device, for looking objects up; reading it takes longer than a trial."""
+    """Return the object dictionary of a device for look-ups; cached, since reading it takes longer than a trial."""
     return find_device(device).new_dictionary()
 
 
 class DriveAudit(Observer):
-    """Counts a tuner's time, moves and violations, and hides the machine.
+    """Counts a tuner's time, moves and violations, and hides the emulated machine from the tuner.
 
     Args:
-        target: What is tuned.
+        target: The target to be tuned.
 
     Attributes:
-        seconds: When each axis was last written to, or moved by what was played [s], (num_axes,): until then it was in
-            use.
-        elapsed: Time that passed [s].
-        violations: By kind of `KINDS`, (4, num_axes).
+        seconds: Time of the last write to each axis, or of its last played motion [s], shape (num_axes,): the axis
+            was in use until then.
+        elapsed: Time since the audit began [s].
+        violations: Number of violations by kind of `KINDS`, shape (4, num_axes).
     """
 
     objects = (cia402.POSITION_ACTUAL, cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL, cia402.STATUSWORD)
@@ -80,11 +80,11 @@ class DriveAudit(Observer):
         self._outside: Mask = np.zeros((len(KINDS), count), bool)
         self._last_current = np.zeros(count)
         self._squares, self._in_block = np.zeros(count), 0
-        self._shaken = np.zeros(count, np.int64)  # blocks in a row
+        self._shaken = np.zeros(count, np.int64)  # number of shaking blocks in a row
 
     @property
     def moves(self) -> Integers:
-        """Commanded motions from standstill to standstill so far, as moves.py counts them, (num_axes,)."""
+        """Commanded motions from standstill to standstill so far, as move_counter.py counts them, shape (num_axes,)."""
         return self._counter.moves
 
     def written(self, below: Drives, name: ObjectName, value: ArrayLike, where: Mask | None) -> None:
@@ -95,14 +95,14 @@ class DriveAudit(Observer):
         self._counter.written((entry.index, entry.sub), value, axes)
 
     def passed(self, below: Drives, duration: float, trace: Trace, asked: Sequence[ObjectName], play: Rows) -> None:
-        """Count time, moves and violations."""
+        """Count time, moves and violations of a passed duration."""
         self.elapsed += duration
         rows = {(entry.index, entry.sub): values for entry, values in self._entries(play)}
         moved = self._counter.passed(round(duration / CYCLE), rows)
         self.seconds[moved] = self.elapsed
         self._watch(trace)
         current = np.asarray(trace[cia402.TORQUE_ACTUAL], float) * self._ampere
-        if play:  # what is played is to shake the axis
+        if play:  # played rows excite the axis on purpose
             self._shaken[:] = 0
             self._squares[:], self._in_block, self._last_current = 0.0, 0, current[-1]
         else:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 
 class Estimate(NamedTuple):
-    """A value with its 95 % confidence interval; one that was not identified is nan, with the `reason`."""
+    """A value with its 95 % confidence interval; nan with the `reason` if it was not identified."""
 
     value: float
     low: float
@@ -17,15 +17,15 @@ class Estimate(NamedTuple):
 
     @property
     def is_known(self) -> bool:
-        """Whether there is a value."""
+        """Whether the value was identified."""
         return math.isfinite(self.value)
 
 
 def interval(low: float, high: float) -> str:
-    """Return an interval in words; that of a whole number without doubt is "exact"."""
+    """Format an interval; one of zero width, as of an identified whole number, is "exact"."""
     return "exact" if low == high else f"{low:.4g} to {high:.4g}"
 
 
 def refused(unit: str, reason: str) -> Estimate:
-    """Return the estimate of what could not be identified."""
+    """Return the estimate for a value that could not be identified: nan, with the reason."""
     return Estimate(math.nan, math.nan, math.nan, unit, reason)

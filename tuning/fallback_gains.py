@@ -1,7 +1,7 @@
 """Slow fallback gains for axes that keep oscillating, even with the last good gains.
 
-A trial stops an axis that oscillates and returns to the last good gains. These may be so near to instability that the
-axis, once shaken, stays in a limit cycle with them; this is detected only here.
+A trial stops an axis that oscillates and returns to the last good gains. These may be so close to instability that the
+axis, once excited, stays in a limit cycle with them; only this observer detects that.
 """
 
 from __future__ import annotations
@@ -20,27 +20,27 @@ from drive_env.trials.oscillation import shakes
 from drive_env.trials.positioning import WATCH
 from mechanics.arrays import Floats, Integers, Mask
 
-WINDOWS = 3  # of 25 ms in a row: a trial has acted after the first, and good gains have had the second to calm it
+WINDOWS = 3  # of 25 ms in a row: a trial reacts after the first, and good gains have the second to damp the oscillation
 
 
 class FallbackGains(Observer):
-    """Gives axes slow gains when they shake for too long.
+    """Gives slow gains to axes that oscillate for too long.
 
     Args:
-        num_axes: Axes.
-        rated_current: Of their motors [A].
-        windows: Of 25 ms in a row in which an axis shakes; a trial acts after the first.
+        num_axes: Number of axes.
+        rated_current: Rated current of their motors [A].
+        windows: Oscillating windows of 25 ms in a row until the slow gains are given; a trial reacts after the first.
 
     Attributes:
-        calm: The slow gains, (num_axes, count), or None as long as none are known.
-        calmed: Axes that got them since the last `begin`, (num_axes,).
+        calm: The slow gains, shape (num_axes, count); None until they are known.
+        calmed: Axes that got them since the last `begin`, shape (num_axes,).
     """
 
     def __init__(self, num_axes: int, rated_current: float, windows: int = WINDOWS) -> None:
         self.calm: Integers | None = None
         self.calmed: Mask = np.zeros(num_axes, bool)
         self._rated = rated_current
-        self._ampere: Floats | float | None = None  # of a count of the current
+        self._ampere: Floats | float | None = None  # amperes per count of the current
         self._most = windows
         self._windows = np.zeros(num_axes, np.int64)
 
@@ -50,7 +50,7 @@ class FallbackGains(Observer):
         self._windows[:] = 0
 
     def passed(self, below: Drives, duration: float, trace: Trace, asked: Sequence[ObjectName], play: Rows) -> None:
-        """Give slow gains to axes that have shaken too long."""
+        """Give slow gains to axes that have oscillated for too long."""
         if self.calm is None or cia402.TORQUE_ACTUAL not in asked or len(trace) != WATCH:
             return
         if self._ampere is None:

@@ -1,8 +1,8 @@
-"""The energy that a motion feeds back into a drive's DC link, and the link's capacity until the drive cuts its stage.
+"""The energy that a motion feeds back into a drive's DC link, and how much the link takes until the drive trips.
 
-A stop feeds back the kinetic energy. A weight that goes down feeds back as long as it goes, through a motor that
-merely holds it: power -K_t i omega with i = holding + (J domega/dt) / K_t, less what the winding loses. The current
-that holds the axis is measured at the motor, and what the transmission loses is in it. A supply may not take it back.
+A stop feeds back the kinetic energy. A weight that moves down feeds back during the whole motion, since the motor only
+holds it: power -K_t i omega with i = holding + (J domega/dt) / K_t, less the losses of the winding. The holding current
+is measured at the motor, so it contains the losses of the transmission. A supply may be unable to take the energy back.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ if TYPE_CHECKING:
     from tuning.target import Target
 
 
-LINK_SHARE = 0.8  # of what the link holds, that is filled: the supply may be higher than what was entered
-SLOWER = 0.9  # by which positioning moves are made slower in turn that would overcharge the link
+LINK_SHARE = 0.8  # share of the link's energy that is used: the supply voltage may be higher than entered
+SLOWER = 0.9  # factor by which speed and ramp of moves that would overcharge the link are reduced repeatedly
 
 
 def link_energy(target: Target) -> Floats:
-    """Return the energy that each DC link holds above its supply until the stage is cut [J], shape (num_axes,).
+    """Return the energy that each DC link can take from its supply voltage to overvoltage [J], shape (num_axes,).
 
-    By the least capacitance of the drive's class. The axes of a drive share its link, and may brake at one time.
+    Computed with the least capacitance of the device class. The axes of a drive share its link and may brake together.
     """
     device = target.device
     square = np.maximum(device.overvoltage**2 - target.supply**2, 1.0)
@@ -38,18 +38,18 @@ def link_energy(target: Target) -> Floats:
 def fed_back(
     motor: Motor, speed: Floats, step: float, inertia: ArrayLike, holding: ArrayLike, friction: ArrayLike = 0.0
 ) -> Floats:
-    """Return the most energy that a motion has fed into the DC link at any moment [J], shape (num_axes,).
+    """Return the greatest energy that a motion has fed into the DC link at any time [J], shape (num_axes,).
 
-    What the motor draws afterwards empties the link first. The weight may pull either way: the worse one counts.
+    Energy that the motor draws later empties the link first. The direction of the weight is unknown: the worse counts.
 
     Args:
-        motor: What turns each axis.
-        speed: Of the rotors [rad/s], shape (rows, num_axes).
-        step: From row to row [s].
-        inertia: Total inertia [kg*m^2], (num_axes,) or one for all.
-        holding: Current that holds the axis [A], alike. What dry friction has in it at rest, it has in motion, too:
-            such a one needs no other friction.
-        friction: Current that dry friction takes in motion for sure [A], alike.
+        motor: Motor of each axis.
+        speed: Speed of the rotors [rad/s], shape (rows, num_axes).
+        step: Time between rows [s].
+        inertia: Total inertia [kg*m^2], shape (num_axes,) or one value for all.
+        holding: Current that holds the axis [A], shape as `inertia`. The part of it caused by dry friction at rest also
+            acts in motion, so `friction` must not contain it again.
+        friction: Least current that dry friction takes in motion [A], shape as `inertia`.
     """
     K = motor.torque_constant
     before = np.concatenate([np.zeros((1, speed.shape[1])), speed])
@@ -65,13 +65,13 @@ def fed_back(
 
 
 def trial_reach(target: Target, inertia: ArrayLike, holding: ArrayLike, reach: Floats) -> Floats:
-    """Return the reach for which the moves of trials are planned so that they do not overcharge the DC link.
+    """Return the reach for which moves of trials must be planned so that they do not overcharge the DC link.
 
     Args:
         target: The drives.
-        inertia: Total inertia [kg*m^2], (num_axes,) or one for all.
-        holding: Current that holds the axis [A], alike.
-        reach: How far the rotors may turn, with the sign [rad], (num_axes,).
+        inertia: Total inertia [kg*m^2], shape (num_axes,) or one value for all.
+        holding: Current that holds the axis [A], shape as `inertia`.
+        reach: Signed angle that the rotors may turn [rad], shape (num_axes,).
     """
     T, scale = PROFILE * CYCLE, target.drives.read(Role.POSITION_SCALE)
     move = plan_move(target.motor, np.broadcast_to(inertia, reach.shape), scale, reach, highest_ramp(target.device))
@@ -90,16 +90,16 @@ def bearable_speed(
     speed: Floats,
     ramp: Floats,
 ) -> Floats:
-    """Return the share of speed and ramp, 1 at most, with which moves do not overcharge the DC link, (num_axes,).
+    """Return the factor (at most 1) on speed and ramp at which moves do not overcharge the DC link, shape (num_axes,).
 
     Args:
         target: The drives.
-        inertia: Total inertia [kg*m^2], (num_axes,) or one for all.
-        holding: Current that a weight takes [A], alike.
-        friction: Current that dry friction takes at least [A], alike.
-        way: Of the moves, without their sign [rad], (num_axes,).
-        speed: Of the profile [rad/s], alike.
-        ramp: Of the profile [rad/s^2], alike.
+        inertia: Total inertia [kg*m^2], shape (num_axes,) or one value for all.
+        holding: Current that a weight takes [A], shape as `inertia`.
+        friction: Least current that dry friction takes [A], shape as `inertia`.
+        way: Length of the moves [rad], not negative, shape (num_axes,).
+        speed: Profile speed [rad/s], shape (num_axes,).
+        ramp: Profile acceleration [rad/s^2], shape (num_axes,).
     """
     share = np.ones(target.num_axes)
     while (over := _overcharges(target, inertia, holding, friction, way, share * speed, share * ramp)).any():
@@ -116,7 +116,7 @@ def _overcharges(
     speed: Floats,
     ramp: Floats,
 ) -> Mask:
-    """Return which axes' moves would overcharge the DC link, (num_axes,); arguments as `bearable_speed` has them."""
+    """Return which axes' moves would overcharge the DC link, shape (num_axes,); arguments as in `bearable_speed`."""
     way, speed, ramp = (np.maximum(row, 1e-9) for row in (way, speed, ramp))
     rise = np.minimum(speed / ramp, np.sqrt(way / ramp))
     end = rise + way / (ramp * rise)

@@ -1,4 +1,4 @@
-"""Whether the axes of a machine pull at one thing, or at one another: a user sees it, a drive does not."""
+"""Whether the axes of a machine are coupled mechanically: its user knows that, its drives cannot measure it."""
 
 from __future__ import annotations
 
@@ -14,19 +14,20 @@ if TYPE_CHECKING:
 
 
 def are_linked(load: PackedLoad) -> bool:
-    """Return whether turning one axis, the others at rest, strains a spring that joins them."""
+    """Return whether turning one axis with the others at rest strains a spring between them."""
     turning = way(load).joints
     strain = np.einsum("ad,de,ae->a", turning, load.plant.stiffness[..., 0], turning)
     return load.num_axes > 1 and bool(np.any(strain > 0.0))
 
 
-APART = 0.01  # inertia that couples two axes over the mean of their own, up to which they move as if alone
+APART = 0.01  # greatest ratio of coupling inertia to the mean of the two axes' own at which they count as independent
 
 
 def are_independent(load: PackedLoad) -> bool:
-    """Return whether each axis moves as if it were alone: no spring and no inertia couples it with another, anywhere.
+    """Return whether each axis moves independently: no spring and no inertia couples it with another, in any pose.
 
-    The axes of a portal do; the joints of an arm, which accelerate one another, and the ends of a gantry do not.
+    True for the axes of a portal; false for the joints of an arm, which accelerate one another, and for a gantry's
+    ends.
     """
     if load.num_axes == 1:
         return True

@@ -1,8 +1,10 @@
-"""Counts the moves of an axis as an engineer beside the machine would.
+"""Counts the moves of an axis as an observer of the machine would.
 
-A move is a commanded motion from standstill to standstill. In pp it is a set-point (bit 4 of the controlword rises). In
-the other modes it is a target that leaves rest, until it has rested for 20 ms: there and back without a stop is one
-move, and so is a frequency response, however many records it took.
+A move is a commanded motion from standstill to standstill. In pp each set-point is one (bit 4 of the controlword
+rises).
+In the other modes it begins when a target starts to change and ends when the target has rested for 20 ms: there and
+back
+without a stop is one move, and so is a frequency response, however many records it takes.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ from drive_env.trials.positioning import CYCLE
 from mechanics.arrays import Floats, Integers, Mask
 
 REST = 20  # cycles at rest that end a move
-SLOW, WEAK = 0.002, 0.02  # of the speed and the current that axes may be moved with: less holds a place
+SLOW, WEAK = 0.002, 0.02  # as a share of greatest speed and current: smaller commands only hold the position
 CONTROLWORD, SET_POINT = (cia402.CONTROLWORD, 0), 0x10
 POSITIONS, SPEEDS, TORQUES = (
     ((cia402.TARGET_POSITION, 0), (cia402.POSITION_OFFSET, 0)),
@@ -28,15 +30,15 @@ POSITIONS, SPEEDS, TORQUES = (
 
 
 class MoveCounter:
-    """Counts moves by writes and played rows.
+    """Counts moves from written objects and played rows.
 
     Args:
-        speed: Fastest that axes may be turned [inc/s], shape (num_axes,).
-        current: Most that may be asked for, in counts of a torque.
-        per_increment: Counts of a speed per increment a second.
+        speed: Greatest speed of the axes [inc/s], shape (num_axes,).
+        current: Greatest torque that may be commanded [counts].
+        per_increment: Counts of a velocity per increment per second.
 
     Attributes:
-        moves: Of each axis so far, (num_axes,).
+        moves: Number of moves of each axis so far, shape (num_axes,).
     """
 
     def __init__(self, speed: Floats, current: Floats | float, per_increment: Floats | float = 1.0) -> None:
@@ -48,13 +50,13 @@ class MoveCounter:
             **dict.fromkeys(TORQUES, np.full(count, WEAK * current)),
         }
         self._word = np.zeros(count, np.int64)
-        self._standing: dict[Key, Integers] = {}  # targets as they were commanded last
-        self._running = {key: np.zeros(count, bool) for key in SPEEDS}  # where that is not rest
-        self._played: frozenset[Key] = frozenset()  # when time passed last
-        self._still = np.full(count, REST)  # cycles since a target moved last
+        self._standing: dict[Key, Integers] = {}  # last commanded value of each target
+        self._running = {key: np.zeros(count, bool) for key in SPEEDS}  # axes whose commanded speed is not 0
+        self._played: frozenset[Key] = frozenset()  # targets played in the last passed time
+        self._still = np.full(count, REST)  # cycles since the target last moved
 
     def written(self, key: Key, value: ArrayLike, where: Mask) -> None:
-        """Note an object that is written on the axes where the mask is true."""
+        """Count moves started by an object written on the axes where the mask is true."""
         values = np.broadcast_to(np.asarray(value, np.int64), self.moves.shape)
         if key == CONTROLWORD:
             self.moves += where & (values & SET_POINT != 0) & (self._word & SET_POINT == 0)
@@ -70,7 +72,7 @@ class MoveCounter:
             self._standing[key] = np.where(where, values, before)
 
     def passed(self, cycles: int, play: Mapping[Key, ArrayLike] | None = None) -> Mask:
-        """Note time that passes, while rows of objects are played; return which axes those move."""
+        """Count moves in passed time with played rows of objects; return the axes that they move, shape (num_axes,)."""
         count = len(self.moves)
         moving = np.zeros((cycles, count), bool)
         played = {key: rows for key, rows in (play or {}).items() if key in self._slow}
@@ -81,15 +83,15 @@ class MoveCounter:
             if key in SPEEDS:
                 away = values
                 self._running[key] = np.abs(values[-1]) > self._slow[key]
-            elif key in TORQUES:  # what held the axis before, against gravity for one, moves nothing
+            elif key in TORQUES:  # a constant torque, for example against gravity, does not move the axis
                 away = values - before
-            else:  # where the first row goes on from is known if there was a row before it
+            else:  # the first row can only be compared with a row before it if one was played
                 away = np.diff(values, axis=0, prepend=(before if key in self._played else values[0])[None])
             moving |= np.abs(away) > self._slow[key]
             self._standing[key] = values[-1]
         self._played = frozenset(played)
         driven = np.asarray(moving.any(axis=0))
-        # A speed that stands is one until another is commanded.
+        # A commanded speed stays in effect until another is written.
         for key, runs in self._running.items():
             if key not in played:
                 moving |= runs
@@ -108,6 +110,6 @@ class MoveCounter:
         return np.asarray(np.any([*self._running.values()], axis=0))
 
     def _begin(self, axes: Mask) -> None:
-        """Count moves that begin with a target written."""
+        """Count a move of each axis whose target was written after a rest."""
         self.moves += axes & (self._still >= REST)
         self._still = np.where(axes, 0, self._still)

@@ -1,8 +1,9 @@
 """A watch over drives in experiments: an axis that oscillates is switched off within 50 ms.
 
-Time passes in windows of 25 ms, and the currents of each are looked at before the next begins. An axis that moves
-quietly has a current that hardly changes from one millisecond to the next; one that is shaken on purpose has a current
-no larger than it takes. A loop that oscillates breaks the one rule or the other.
+Time passes in windows of 25 ms; the currents of each are checked before the next begins. The current of an axis that
+moves quietly hardly changes from one millisecond to the next; that of an axis excited on purpose stays below the
+allowed
+value. A loop that oscillates breaks one of the two rules.
 """
 
 from __future__ import annotations
@@ -23,27 +24,27 @@ from drive_env.trials.positioning import WATCH
 from mechanics.arrays import Floats, Integers, Mask
 
 CLEAR = 3.0
-SOFTER = 4  # by what the velocity gains of an axis are divided that oscillates with gains of our own
+SOFTER = 4  # divisor of the velocity gains of an axis that oscillates with gains chosen by the tuner
 
 
 class OscillationError(RuntimeError):
-    """All axes that were experimented on have oscillated, and are off."""
+    """All axes under experiment have oscillated and are switched off."""
 
 
 class OscillationWatch(Observer):
-    """Switches an axis off that oscillates, to coast, as after a fault.
+    """Switches the voltage of an oscillating axis off, so that it coasts as after a fault.
 
     Args:
-        where: Axes that are experimented on, shape (num_axes,).
-        limit: Most current that is asked of each axis [A], shape (num_axes,).
-        noise: RMS of the current's samples at rest [A]: a swing within it is no oscillation.
+        where: Axes under experiment, shape (num_axes,).
+        limit: Greatest current commanded to each axis [A], shape (num_axes,).
+        noise: RMS of the current samples at rest [A]; smaller changes are not an oscillation.
 
     Attributes:
-        limit: As given; it may be lowered.
+        limit: As given; it may be lowered later.
         swung: Axes that oscillated and were switched off, shape (num_axes,).
-        frequency: At which each did so last [Hz], to 40 Hz; nan before, shape (num_axes,).
+        frequency: Frequency of each axis' last oscillation [Hz], at most 40 Hz; nan without one, shape (num_axes,).
 
-    What lets time pass raises OscillationError once all of them have.
+    Letting time pass raises OscillationError once all axes under experiment have oscillated.
     """
 
     objects = (cia402.TORQUE_ACTUAL,)
@@ -52,25 +53,25 @@ class OscillationWatch(Observer):
         self._where = where
         self.limit = limit
         self._least = CLEAR * noise
-        self._ampere: Floats | float | None = None  # of a count of the current
-        self._shaken: Floats | None = None  # most current meanwhile [A RMS]
-        self._window: list[Floats] = []  # currents since the last look, the one before it among them
+        self._ampere: Floats | float | None = None  # amperes per count of the current
+        self._shaken: Floats | None = None  # allowed current during an excitation [A RMS]; None without one
+        self._window: list[Floats] = []  # currents since the last check, with the sample before them
         self.swung: Mask = np.zeros(len(where), bool)
         self.frequency: Floats = np.full(len(where), np.nan)
 
     def patience(self) -> int:
-        """Return the cycles until the window is full."""
+        """Return the number of cycles until the window is full."""
         return WATCH - self._looked()
 
     def passed(self, below: Drives, duration: float, trace: Trace, asked: Sequence[ObjectName], play: Rows) -> None:
-        """Look at the currents, and switch oscillating axes off."""
+        """Check the currents, and switch oscillating axes off."""
         if self._ampere is None:
             self._ampere = ampere_per_count(below)
         self._look(below, np.asarray(trace[cia402.TORQUE_ACTUAL], float) * self._ampere)
 
     @contextmanager
     def shaken(self, current: Floats) -> Iterator[None]:
-        """Allow so much current meanwhile [A RMS], shape (num_axes,), however it changes."""
+        """Allow this current, however it changes, during the block [A RMS], shape (num_axes,)."""
         before, self._shaken = self._shaken, current
         self._window.clear()
         try:
@@ -80,16 +81,16 @@ class OscillationWatch(Observer):
             self._window.clear()
 
     def soften(self, drives: Drives, where: Mask, gains: Integers, mode: str) -> Integers:
-        """Enable axes again that were switched off, with softer velocity gains, and watch them anew.
+        """Enable switched-off axes again with softer velocity gains, and watch them again.
 
         Args:
-            drives: The drives, as they are watched.
-            where: Which, shape (num_axes,).
+            drives: The watched drives.
+            where: Axes to enable, shape (num_axes,).
             gains: Raw gains of all axes, shape (num_axes, count).
             mode: "csv" or "csp".
 
         Returns:
-            The gains, softer where the mask is true.
+            The gains, softened where the mask is true.
         """
         softer = np.where(where[:, None], device_of(drives).gains.softened(gains, SOFTER, "velocity"), gains)
         write_gains(drives, softer, where)
@@ -121,13 +122,13 @@ class OscillationWatch(Observer):
 
 
 def watch_of(drives: Drives) -> OscillationWatch | None:
-    """Return the watch of drives for oscillation, None without one."""
+    """Return the oscillation watch of drives; None if they have none."""
     return next((each for each in drives.observers if isinstance(each, OscillationWatch)), None)
 
 
 @contextmanager
 def shaken(drives: Drives, current: Floats) -> Iterator[None]:
-    """Have drives, if they are watched, allow so much current meanwhile [A RMS], shape (num_axes,)."""
+    """Allow this current during the block [A RMS], shape (num_axes,), if the drives have an oscillation watch."""
     watch = watch_of(drives)
     if watch is None:
         yield

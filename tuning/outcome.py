@@ -1,4 +1,4 @@
-"""A tuner: a function of a target and a random generator, and its result."""
+"""The interface of tuners: a function of a target and a random generator that returns an `Outcome`."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from tuning.target import Target
 
 
 class Outcome(NamedTuple):
-    """The result of a tuner, of every axis.
+    """The result of a tuner for all axes.
 
     gains: Raw integers in the order of the device's gain set, shape (num_axes, gains).
-    drive_seconds: Time on the drive [s], (num_axes,).
-    moves: Moves and other excitations, (num_axes,).
-    aborts: Trials and moves that had to be stopped, (num_axes,).
-    violations: How often it left its limits, (num_axes,).
-    notes: One text per axis, "" for none.
-    accepted: Axes whose gains the tuner vouches for, (num_axes,); None is all.
+    drive_seconds: Time on the drive [s], shape (num_axes,).
+    moves: Number of moves and other excitations, shape (num_axes,).
+    aborts: Number of trials and moves that had to be stopped, shape (num_axes,).
+    violations: Number of violations of limits, shape (num_axes,).
+    notes: One text per axis, "" without a note.
+    accepted: Axes whose gains the tuner guarantees, shape (num_axes,); None means all.
     """
 
     gains: Integers

@@ -1,7 +1,8 @@
-"""The checks before a tuning on a bus, by reading only: nothing is written, no state is changed.
+"""The checks before a tuning on a bus; they only read: nothing is written, no state is changed.
 
-Everything that a run needs is looked at: who answers, whether the objects are there, how fast answers come, whether
-the samples fit into PDOs, who watches over the master, what the motor's row says against what the drive was set to.
+They check everything that a run needs: which nodes answer, whether the objects exist, how fast answers come, whether
+the samples fit into PDOs, whether the drive monitors its master, and whether the drive's settings agree with the
+motor's data.
 """
 
 from __future__ import annotations
@@ -24,13 +25,14 @@ from drive_env.trials.demand import COMPUTED, is_recorded
 if TYPE_CHECKING:
     from tuning.target import Target
 
-OK, NOTE, NO = "ok", "note", "no"  # a run would begin, would begin all the same, would not
+OK, NOTE, NO = "ok", "note", "no"  # a run would begin; would begin despite a remark; would not begin
 
-READS = 50  # of the statusword, to see how fast answers come
-SLOWEST = 0.01  # s, the median of those; a trial that watches for oscillation asks more often
+READS = 50  # of the statusword, to measure how fast answers come
+SLOWEST = 0.01  # s, limit of their median; a trial that watches for oscillation reads more often
 AT_REST = 0.02  # of the speed limit
 BY_ENCODER = 3  # 2055h
-# What a trial samples besides the envelope's own, and what it plays (gain_trial.py, frequency_response.py).
+# Objects that a trial samples in addition to the envelope's, and those that it plays (gain_trial.py,
+# frequency_response.py).
 SAMPLED, PLAYED = (
     (cia402.POSITION_ACTUAL, cia402.POSITION_DEMAND, cia402.TORQUE_ACTUAL, cia402.STATUSWORD),
     (cia402.TARGET_POSITION,),
@@ -38,7 +40,7 @@ SAMPLED, PLAYED = (
 
 
 class Check(NamedTuple):
-    """A check: its name, OK, NOTE or NO, and the result, with the remedy where it is a NO."""
+    """A check: its name, its verdict (OK, NOTE or NO), and the result, with the remedy if it is NO."""
 
     what: str
     verdict: str
@@ -49,11 +51,11 @@ class Write(NamedTuple):
     """An object that a run would write.
 
     key: Index and sub-index of the object.
-    name: Its own.
-    values: Between which limits, or which.
-    why: What for.
-    present: What the drive holds now, of each axis; None where it cannot be read.
-    stays: Whether the drive has the new value afterwards; all others are put back.
+    name: Name of the object.
+    values: The range of written values, or the values, as text.
+    why: Purpose.
+    present: Present value of each axis; None if it cannot be read.
+    stays: Whether the drive has the new value after the run; all others are restored.
     """
 
     key: tuple[int, int]
@@ -72,19 +74,19 @@ class Rehearsal(NamedTuple):
 
     @property
     def refused(self) -> list[Check]:
-        """Whether a run would not start."""
+        """The checks that prevent a run; empty if it would start."""
         return [check for check in self.checks if check.verdict == NO]
 
 
 def rehearse(target: Target, *, keep: bool = True) -> Rehearsal:
-    """Check drives on a bus without writing, and return the checks and the plan of a run.
+    """Check drives on a bus without writing, and list the objects that a run would write.
 
     Args:
         target: The drives, as `tuning.target.on_bus` opens them.
-        keep: Whether the run would have the drives keep the gains over a power cycle.
+        keep: Whether the run would have the drives store the gains over a power cycle.
 
     Raises:
-        BusError: If a node does not answer any more.
+        BusError: If a node no longer answers.
     """
     checks: list[Check] = []
     for axis in range(target.num_axes):
@@ -108,13 +110,13 @@ def _read(target: Target, name: Any, axis: int) -> int:
 
 
 def _node(target: Target, axis: int) -> int:
-    """Return the address of the node that an axis is of."""
+    """Return the address of the node that has an axis."""
     drives = bus_of(target.drives)
     return drives.nodes[axis // drives.description.num_axes]
 
 
 def _place(target: Target, axis: int) -> str:
-    """Return the node of an axis as messages name it, and which of its axes, where it has several."""
+    """Return an axis' node as messages name it, with the axis' number if the node has several."""
     per_node = bus_of(target.drives).description.num_axes
     name = f"{'node' if _is_on_can(target) else 'position'} {_node(target, axis)}"
     return name if per_node == 1 else f"{name} axis {axis % per_node}"
@@ -126,7 +128,7 @@ def _is_on_can(target: Target) -> bool:
     return isinstance(bus_of(target.drives).link, CanLink)
 
 
-# --- what is looked at ------------------------------------------------------------------------------------------------
+# --- the checks -------------------------------------------------------------------------------------------------------
 def _identity(target: Target, axis: int) -> Iterator[Check]:
     drives, facts = bus_of(target.drives), []
     for name, word in ((0x1008, ""), (0x1009, "hardware "), (0x100A, "software "), ((0x1018, 1), "vendor "),
@@ -177,7 +179,7 @@ def _answers(target: Target, axis: int) -> Iterator[Check]:
 
 
 def _samples(target: Target, axis: int) -> Iterator[Check]:
-    """Check that sampled and played objects fit, and that their PDOs have identifiers."""
+    """Check that the sampled and played objects fit into PDOs, and that these have 11-bit identifiers."""
     if not _is_on_can(target):
         yield _images(target)
         return
@@ -228,7 +230,7 @@ def _images(target: Target) -> Check:
 
 
 def _error_control(target: Target, axis: int) -> Iterator[Check]:
-    """Look who would stop the drive if this process died."""
+    """Check by which error control the drive would stop if this process died."""
     drives, description = bus_of(target.drives), bus_of(target.drives).description
     silence = None if drives.safety is None else drives.safety.limits.silence
     if silence is None:
@@ -287,7 +289,7 @@ def _motor(target: Target, axis: int) -> Iterator[Check]:
 def _supply(target: Target, axis: int) -> Iterator[Check]:
     volts = float(target.supply[axis])
     text = f"{volts:g} V entered; the drive cannot measure it: measure it yourself, since the gains scale with it"
-    # A drive without objects of its chopper looks after it by itself.
+    # A drive without chopper objects controls its chopper itself.
     chops = Role.BRAKE_CHOPPER in target.device.roles and _read(target, Role.BRAKE_CHOPPER, axis) != 0
     chopper = _read(target, Role.BRAKE_CHOPPER_VOLTAGE, axis) * 0.1 if chops else np.inf
     if chopper <= volts:
@@ -313,7 +315,7 @@ def _travel(target: Target, axis: int) -> Iterator[Check]:
 
 
 def _envelope(target: Target, axis: int) -> Iterator[Check]:
-    """Add the limits that would stop the drives while a run acts on them."""
+    """Report the limits of the envelope that would stop the drives during a run."""
     if target.drives.safety is None:
         yield Check("envelope", NO, "there is none: open the drives with a safety envelope")
         return
@@ -354,7 +356,7 @@ LOOKS = (_identity, _state, _answers, _samples, _error_control, _motor, _supply,
 
 # --- what would be written --------------------------------------------------------------------------------------------
 def _plan(target: Target, keep: bool) -> Iterator[tuple[ObjectName, str, str, bool]]:
-    """Yield the objects that a run writes: which, between which limits, what for, and whether that stays."""
+    """Yield the objects that a run writes: name, range of values, purpose, and whether the value stays afterwards."""
     from tuning.identify.wiring import FINDINGS
 
     turn = target.increments()
@@ -394,7 +396,7 @@ def _plan(target: Target, keep: bool) -> Iterator[tuple[ObjectName, str, str, bo
 
 
 def _communication(target: Target) -> Iterator[tuple[ObjectName, str, str, bool]]:
-    """Yield the writes that bring samples in PDOs and have the drive watch over its master."""
+    """Yield the writes that map samples to PDOs and have the drive monitor its master."""
     if _is_on_can(target):
         yield from _pdos(target)
     else:
@@ -420,7 +422,7 @@ def _pdos(target: Target) -> Iterator[tuple[ObjectName, str, str, bool]]:
 
 
 def _safeguards(target: Target) -> Iterator[tuple[ObjectName, str, str, bool]]:
-    """Yield the writes after which the drive stops by itself where it must."""
+    """Yield the writes of limits and monitoring by which the drive stops by itself."""
     if np.isfinite(target.low).all() and np.isfinite(target.high).all():
         for sub, end in ((1, "lower"), (2, "upper")):
             if bus_of(target.drives).description.has((cia402.POSITION_LIMITS, sub)):

@@ -1,7 +1,7 @@
 """The parameters of drives before a change: saved to a file, and restored.
 
-A `Transaction` writes the file before anything else happens, so that even a process that is killed leaves it behind;
-`drive-tune undo FILE` brings the drives back to it. Axes that are not committed are rolled back at the end.
+A `Transaction` writes the file before anything else, so that the file exists even if the process is killed; `drive-tune
+undo FILE` restores the drives from it. Axes that are not committed are rolled back at the end.
 """
 
 from __future__ import annotations
@@ -50,11 +50,11 @@ if TYPE_CHECKING:
     from tuning.target import Target
 
 
-SWITCH_OFF = 1000  # cycles that switching the voltage off may take
+SWITCH_OFF = 1000  # cycles until the voltage must be off
 STORE = (0x1010, 1)
-DEVICE_OBJECTS = 0x2000  # from here on: what lies below is how drives talk, which their master has in use
-# Set-points with which an axis turns as soon as it is enabled. A program that dies leaves them, and no parameter file
-# has them: they are commands.
+DEVICE_OBJECTS = 0x2000  # first object of the device; objects below are communication, in use by the master
+# Set-points that turn an axis as soon as it is enabled. A program that dies leaves them in the drive, and no parameter
+# file has them, since they are commands.
 SET_POINTS = (cia402.TARGET_TORQUE, cia402.TARGET_VELOCITY, cia402.TORQUE_OFFSET, cia402.VELOCITY_OFFSET)
 
 
@@ -64,16 +64,16 @@ class SnapshotError(ValueError):
 
 @dataclass(frozen=True)
 class Snapshot:
-    """All parameters of drives as they were.
+    """All parameters of drives at one time.
 
     Attributes:
         device: Name of the device.
-        axes: Of every axis, (index, sub-index) -> raw integer.
-        bus: What opens the drives again, for `CanDrives`; empty for emulated drives.
-        stored: Whether the drives stored the change; undoing it is then stored, too.
-        identities: What each node said of itself; empty for emulated drives, and where a file does not say.
-        left_out: Of each axis of the nodes that `bus` does not choose, by its number among all of them, what a master
-            borrows of it all the same: PDOs are mapped, and a watchdog is set, for whole nodes.
+        axes: For each axis, (index, sub-index) -> raw integer.
+        bus: Options of `CanDrives` that open the drives again; empty for emulated drives.
+        stored: Whether the drives stored the change; then undoing it is stored, too.
+        identities: Identity objects of each node; empty for emulated drives, and if the file lacks them.
+        left_out: For each axis that `bus` does not choose, by its number among all axes of the nodes: the values of
+            objects that a master changes all the same, since PDO mapping and watchdog belong to whole nodes.
     """
 
     device: str
@@ -126,15 +126,15 @@ class Snapshot:
 
 
 def take(target: Target) -> Snapshot:
-    """Return the parameters of a target's drives as they are.
+    """Read the parameters of a target's drives.
 
-    Take it before the drives record anything: that maps PDOs on a bus, which are parameters, too.
+    Call it before the drives record anything: recording maps PDOs on a bus, which are parameters, too.
     """
     return take_of(target.drives, target.bus)
 
 
 def take_of(drives: Drives, address: Mapping[str, Any]) -> Snapshot:
-    """Return the parameters of drives as they are; `address` is what opens them again, empty for emulated ones."""
+    """Read the parameters of drives; `address` has the options that open them again, empty for emulated ones."""
     bus = drives.bus
     identities = [] if bus is None else [read_identity(bus, node) for node in range(len(bus.nodes))]
     return Snapshot(
@@ -144,7 +144,7 @@ def take_of(drives: Drives, address: Mapping[str, Any]) -> Snapshot:
 
 def _read_axes(of: Drives) -> tuple[Mapping[Key, int], ...]:
     drives = _per_axis(of)
-    # The dictionary of a module lists the objects of all its axes: each axis has its own, by those of the first.
+    # The dictionary of a module lists the objects of all its axes: each axis keeps its own, under the first axis' keys.
     others = drives.description.of_further_axes()
     return tuple(
         {key: value for key, value in read_parameters(drives, axis).items() if key not in others}
@@ -153,7 +153,7 @@ def _read_axes(of: Drives) -> tuple[Mapping[Key, int], ...]:
 
 
 def _borrowed(drives: Drives) -> dict[int, dict[Key, int]]:
-    """Return the objects that a master changes of the axes of nodes that are left out, with their values."""
+    """Read the objects that a master changes on axes that were not chosen, by the axis' number."""
     bus = drives.bus
     if bus is None:
         return {}
@@ -169,15 +169,15 @@ def _borrowed(drives: Drives) -> dict[int, dict[Key, int]]:
 
 
 def load_snapshot(path: str | Path, *, unchecked: bool = False) -> Snapshot:
-    """Return the snapshot of a file.
+    """Read a snapshot from a file.
 
     Args:
         path: The file.
-        unchecked: Take also one that was changed since it was written, or that has no check sum.
+        unchecked: Accept also a file that was changed since it was written, or that has no check sum.
 
     Raises:
-        SnapshotError: If the file is not a snapshot; FileChangedError if it is not as it was written.
-        CommandObjectError: If it holds commands or services.
+        SnapshotError: If the file is not a snapshot; FileChangedError if it was changed since it was written.
+        CommandObjectError: If it contains objects that are commands or services.
     """
     where = Path(path)
     try:
@@ -203,7 +203,7 @@ def load_snapshot(path: str | Path, *, unchecked: bool = False) -> Snapshot:
 
 
 def _checked_axis(file: Path, table: Any, known: Description) -> dict[Key, int]:
-    """Return the parameters of an axis; SnapshotError, or CommandObjectError, for other tables."""
+    """Check the table of an axis and convert its keys; SnapshotError or CommandObjectError if it is invalid."""
     if not isinstance(table, dict):
         raise SnapshotError(f"{file}: {table!r} is not an axis; give a file that drive-tune saved before a change")
     values = {}
@@ -222,7 +222,7 @@ def _checked_axis(file: Path, table: Any, known: Description) -> dict[Key, int]:
 
 
 def _checked_bus(file: Path, bus: Any) -> dict[str, Any]:
-    """Return the options that open the drives again, without others; SnapshotError if they do not say it."""
+    """Check the options that open the drives again; SnapshotError for unknown keys or wrong types."""
     if not isinstance(bus, dict):
         raise SnapshotError(f"{file}: bus = {bus!r} must be a table; give a file as drive-tune left it")
     for key, value in bus.items():
@@ -242,15 +242,15 @@ _BUS = {"interface": str, "channel": str, "nodes": int, "axes": int, "bitrate": 
 
 
 def check_same_drives(file: object, snapshot: Snapshot, drives: BusSide, *, other_drive: bool = False) -> None:
-    """Raise OtherDriveError unless the nodes of a bus are those that a snapshot was taken of.
+    """Raise OtherDriveError unless the nodes of a bus are those from which a snapshot was taken.
 
     Args:
-        file: The snapshot's, for the message.
-        snapshot: What is to be written.
-        drives: The drives that are there.
-        other_drive: Let any drives pass.
+        file: The snapshot's file, for the message.
+        snapshot: The snapshot to be written.
+        drives: The opened drives.
+        other_drive: Accept other drives.
     """
-    # A file that does not say of which drives it is (`load_snapshot` wants its reader's word for that) fits any.
+    # A file without identities, which `load_snapshot` accepts only with `unchecked`, fits any drive.
     for node, written in zip(range(len(drives.nodes)), snapshot.identities, strict=False):
         check_same_drive(file, written, read_identity(drives, node), other_drive=other_drive)
 
@@ -258,20 +258,20 @@ def check_same_drives(file: object, snapshot: Snapshot, drives: BusSide, *, othe
 def restore(
     drives: Drives, snapshot: Snapshot, where: Mask | None = None, *, whole: bool = True
 ) -> list[list[Difference]]:
-    """Bring drives back to a snapshot, axis by axis, each all or none; return the changes of each.
+    """Restore drives from a snapshot, axis by axis, each completely or not at all; return the changes of each.
 
-    The axes must not be enabled. Set-points of speed and torque are 0 afterwards: no file has them, and with what a
-    program left there an axis would turn once it is enabled.
+    The axes must not be enabled. Set-points of speed and torque are 0 afterwards: no file has them, and an axis would
+    turn with those of an earlier program once it is enabled.
 
     Args:
         drives: The drives, `EmulatedDrives` or `CanDrives`.
-        snapshot: Where to.
-        where: Axes to bring back; all by default.
-        whole: Objects of the communication area as well, and what was borrowed of axes left out, which come last in
-            what is returned: not while the drives' PDOs are in use.
+        snapshot: The state to restore.
+        where: Axes to restore; all by default.
+        whole: Also restore objects of the communication area, and those that were changed on axes not chosen, whose
+            changes come last in the result. Not while the drives' PDOs are in use.
 
     Raises:
-        SnapshotError: If the drives are others; NotRestoredError or RollbackError if a drive refuses.
+        SnapshotError: If the drives are others; NotRestoredError or RollbackError if a drive rejects a value.
     """
     if len(snapshot.axes) != drives.num_axes or snapshot.device != device_of(drives).name:
         raise SnapshotError(
@@ -284,7 +284,7 @@ def restore(
     wanted = [values if whole else _settings(values) for values in snapshot.axes]
     places = _places(drives)
     for axis in map(int, np.flatnonzero(axes)):
-        check_at_rest(single, wanted[axis], places[axis])  # before the first axis is written
+        check_at_rest(single, wanted[axis], places[axis])  # checked for all axes before the first is written
     for key in _set_points(describe(snapshot.device, None)):
         drives.write(key, 0, where=axes)
     for axis in map(int, np.flatnonzero(axes)):
@@ -295,10 +295,10 @@ def restore(
 
 
 def write_parameters(drives: Drives, wanted: Mapping[Key, int]) -> list[list[Difference]]:
-    """Write parameters to every axis, each all or none; return the changes of each. The axes must not be enabled.
+    """Write parameters to each axis, completely or not at all; return the changes of each. No axis may be enabled.
 
     Raises:
-        NotRestoredError, RollbackError: If a drive refuses one.
+        NotRestoredError, RollbackError: If a drive rejects a value.
     """
     single = _per_axis(drives)
     return [write_all_or_none(single, wanted, place) for place in _places(drives)]
@@ -311,11 +311,11 @@ def _set_points(known: Description) -> list[Key]:
 def differences(drives: BusSide, snapshot: Snapshot) -> list[tuple[int, Difference]]:
     """Read drives of a bus; return the parameters that differ from a snapshot, as (number of the axis, difference).
 
-    Set-points of speed and torque that would turn an axis once it is enabled are among them.
+    Includes set-points of speed and torque that would turn an axis once it is enabled.
 
     Args:
         drives: All axes of the nodes.
-        snapshot: What they should have.
+        snapshot: The wanted values.
     """
     known = drives.description
     parts = snapshot.bus.get("axes", range(known.num_axes))
@@ -328,7 +328,7 @@ def differences(drives: BusSide, snapshot: Snapshot) -> list[tuple[int, Differen
 
 @contextmanager
 def undisturbed() -> Iterator[None]:
-    """Have Ctrl-C, and other signals that end a command, wait for the block's end: no drive is left half restored."""
+    """Delay Ctrl-C and other signals that end a command until the block's end: no drive is left half restored."""
     with held_signals() as noted:
         yield
     if noted:
@@ -336,25 +336,25 @@ def undisturbed() -> Iterator[None]:
 
 
 def file_before(kind: str, out: Path | None = None) -> Path:
-    """Return where the state before goes: beside the results in `out`, or in runs/; never a file that is there.
+    """Choose a new file for the state before: beside the results in `out`, or in runs/; existing files are kept.
 
     Args:
         kind: What moves the drives, for the name.
-        out: Folder for its results, if any; or their file, less its ending.
+        out: Folder of the results, or their file without suffix; None selects runs/.
 
     Raises:
-        OSError: If nothing can be written there.
+        OSError: If the file cannot be written there.
     """
     first = Path(f"{run_folder(kind)}-before.toml") if out is None else out.with_name(f"{out.name}-before.toml")
     file, k = first, 2
-    while file.exists():  # the only way back, if it is from a run that was killed
+    while file.exists():  # an existing file may be the only way back from a run that was killed
         file, k = first.with_name(f"{first.stem}-{k}.toml"), k + 1
     check_place(file)
     return file
 
 
 def check_place(file: Path) -> None:
-    """Raise OSError unless a new file can be written there: before a drive is asked for anything."""
+    """Raise OSError unless a new file can be written there; called before any access to the drives."""
     if file.exists():
         raise OSError(f"{file} exists already, and may be the state before an earlier run; choose another file")
     place, writable = nearest_place(file)
@@ -365,19 +365,19 @@ def check_place(file: Path) -> None:
 
 
 def what_is_left(file: Path) -> str:
-    """Return the message of a run that has put everything back."""
+    """Return the message of a run that has restored everything."""
     return f"the drives have their state from before; if not, drive-tune undo {file} restores it"
 
 
 class Transaction:
     """A change of drives that saves the state before to a file, and is undone unless committed.
 
-    Entering takes the snapshot and writes the file; leaving rolls back every axis that was not committed, whatever
-    ended the block.
+    Entering takes the snapshot and writes the file; leaving rolls back every axis that was not committed, also after an
+    exception.
 
     Args:
-        target: What is changed.
-        path: The file to leave.
+        target: The target to change.
+        path: The file to write.
     """
 
     def __init__(self, target: Target, path: str | Path) -> None:
@@ -390,7 +390,7 @@ class Transaction:
         self._ran: Mask = cia402.matches(self._target.drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED)
         self.before = take(self._target)
         self.before.save(self.path)
-        if load_snapshot(self.path) != self.before:  # the only way back
+        if load_snapshot(self.path) != self.before:  # the file is the only way back
             raise OSError(errno.EIO, "the state before does not read back as it was written", str(self.path))
         return self
 
@@ -401,11 +401,11 @@ class Transaction:
         try:
             with undisturbed():
                 if error is not None and self._target.drives.safety:
-                    # What still turns is braked as their own exit would: without voltage it would run on.
+                    # Turning axes are braked first: without voltage they would coast.
                     self._target.drives.safety.stop(str(error) or type(error).__name__)
                 try:
                     self.roll_back(left & ~self._untouched())
-                except SafetyError:  # after a stall the envelope refuses one call, to tell of it
+                except SafetyError:  # after a stall the envelope raises once, to report it
                     self.roll_back(left & ~self._untouched())
                 if np.any(left & self._stored):
                     store(self._target.drives, left & self._stored)
@@ -414,11 +414,11 @@ class Transaction:
                 f"{failure}; the drives may have the gains that were tried: drive-tune undo {self.path} restores the "
                 "state before"
             ) from (error or failure)
-        if isinstance(error, OSError) and error.filename and not self.changed:  # a disk that is full, a folder gone
+        if isinstance(error, OSError) and error.filename and not self.changed:  # disk full, or folder deleted
             raise OSError(error.errno, f"{error.strerror}; {what_is_left(self.path)}", error.filename) from error
 
     def _untouched(self) -> Mask:
-        """Return the axes that another program runs and that were let alone, as they are in a run that refuses them."""
+        """Return enabled axes of another program whose settings are unchanged, as after a run that refuses them."""
         if not self._ran.any():
             return self._ran
         now = _read_axes(self._target.drives)
@@ -436,11 +436,11 @@ class Transaction:
         self._committed |= True if where is None else where
 
     def roll_back(self, where: Mask | None = None, to: Snapshot | None = None) -> None:
-        """Restore the settings of axes, all by default: the gains at once, the rest once they are disabled.
+        """Restore the settings of axes, all by default: the gains immediately, the rest once they are disabled.
 
         Args:
-            where: Which axes.
-            to: A later state than that before; None is that before.
+            where: The axes.
+            to: A later state; None restores the state before.
         """
         drives, wanted = self._target.drives, self.before if to is None else to
         axes = np.ones(drives.num_axes, bool) if where is None else where
@@ -451,9 +451,9 @@ class Transaction:
         restore(drives, wanted, axes, whole=False)
 
     def store(self, where: Mask | None = None) -> bool:
-        """Have the drives keep their parameters over a power cycle; the file says so first.
+        """Have the drives store their parameters over a power cycle; the file records it first.
 
-        Returns whether they do, see `can_store`.
+        False, without storing, if they cannot: see `can_store`.
         """
         if not can_store(self._target):
             return False
@@ -465,7 +465,7 @@ class Transaction:
 
 
 def switch_off(drives: Drives, where: Mask) -> None:
-    """Switch the voltage off and wait until no axis may turn; one in fault is off once its reaction has ended."""
+    """Switch the voltage off and wait until no axis can turn; one in fault is off after its fault reaction."""
     drives.write(cia402.CONTROLWORD, 0x00, where=where)
     for _ in range(SWITCH_OFF):
         if not np.any(where & [cia402.is_live(int(word)) for word in drives.read(cia402.STATUSWORD)]):
@@ -475,16 +475,16 @@ def switch_off(drives: Drives, where: Mask) -> None:
 
 
 def can_store(target: Target) -> bool:
-    """Return whether drives can keep their parameters over a power cycle.
+    """Return whether drives can store their parameters over a power cycle.
 
-    Emulated drives in this process have nothing that outlives it, and some drives have no 1010h (TMCM-3313).
+    False for emulated drives in this process, which end with it, and for drives without 1010h (TMCM-3313).
     """
     bus = target.drives.bus
     return bool(target.bus) and (bus is None or bus.description.has(STORE))
 
 
 def store(drives: Drives, where: Mask | None = None) -> None:
-    """Have drives keep their parameters over a power cycle (1010h)."""
+    """Have drives store their parameters over a power cycle (1010h)."""
     drives.write(STORE, SAVE, where=where)
 
 
@@ -493,10 +493,10 @@ def _settings(values: Mapping[Key, int]) -> dict[Key, int]:
 
 
 def _per_axis(drives: Drives) -> DescribedAxes:
-    """Return drives whose objects are reached axis by axis, as those of a bus are."""
+    """Return drives whose objects are accessed axis by axis, like those of a bus."""
     return drives.bus or SingleAxes(drives, describe(device_of(drives).name, None))
 
 
 def _places(drives: Drives) -> Sequence[int]:
-    """Return where `_per_axis` finds the axes of drives: on a bus among all axes of its nodes."""
+    """Return the numbers of the axes for access through `_per_axis`: on a bus those among all axes of the nodes."""
     return drives.axis_numbers if drives.bus is not None else range(drives.num_axes)

@@ -9,10 +9,10 @@ UNTOLD = "no emergency message with the cause was received"
 
 
 class ToldCauses(Observer):
-    """Remembers the drives' emergencies for as long as a tuner works on them: each can be read but once.
+    """Remembers the drives' emergencies while a tuner works on them: each emergency can be read only once.
 
     Attributes:
-        told: What each axis told last, "" for nothing.
+        told: Last emergencies of each axis as text, "" without any.
     """
 
     def __init__(self, num_axes: int) -> None:
@@ -20,13 +20,13 @@ class ToldCauses(Observer):
 
 
 def stop_causes(drives: Drives) -> list[str]:
-    """Return the emergencies of each axis since they were read last, most important for a message.
+    """Return the emergencies of each axis since they were last read, the most important causes for a message.
 
-    An axis in fault without new emergencies has those from before as its cause, where they are remembered
-    (`tuning.target.timed` does).
+    An axis in fault without new emergencies gets its remembered ones, if the drives have `ToldCauses`
+    (`tuning.target.timed` adds it).
 
     Returns:
-        A text for each axis: "undervoltage (3220h), ..." in the order of the emergencies, or that it has sent none.
+        One text for each axis: "undervoltage (3220h), ..." in the order of arrival, or that none was received.
     """
     told, remembered = told_causes(drives), _remembered(drives)
     if remembered is not None and any(before and not now for now, before in zip(told, remembered.told, strict=True)):
@@ -36,7 +36,7 @@ def stop_causes(drives: Drives) -> list[str]:
 
 
 def told_causes(drives: Drives) -> list[str]:
-    """Return the emergencies of each axis since they were read last, "" for an axis without one."""
+    """Return the emergencies of each axis since they were last read, "" for an axis without one."""
     told: list[dict[str, None]] = [{} for _ in range(drives.num_axes)]
     for message in drives.emergencies():
         if message.code:

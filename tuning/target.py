@@ -1,6 +1,6 @@
 """The target of a tuner: drives, their motors, and the limits within which the axes may be moved.
 
-A tuner gets a target and nothing else, so that it works on emulated machines and on a bus alike.
+A tuner gets a target and nothing else, so that it works with emulated machines and on a bus.
 """
 
 from __future__ import annotations
@@ -37,39 +37,41 @@ if TYPE_CHECKING:
     from mechanics.load import Load
     from tuning.runs.inputs import Input
 
-Travel = tuple[float, float]  # how far a rotor may turn from where it stands [rad], low <= 0 <= high
+Travel = tuple[float, float]  # signed angles that a rotor may turn from its present angle [rad], low <= 0 <= high
 
-# How axes of a bus belong together: machines of their own; joints of one; ends of one thing, none of which goes alone.
+# How axes of a bus are coupled: separate machines; joints of one machine; parts of one rigid thing, which must move
+# together.
 AXES = ("apart", "coupled", "linked")
-LOCKSTEP_PATIENCE = 5.0  # s, for an answer where time waits: a late one says that the computer is busy
+LOCKSTEP_PATIENCE = 5.0  # s, timeout of answers in lockstep: a late answer means that the computer is busy
 FREE: Travel = (-math.inf, math.inf)
 LONGEST_TRAVEL = 1e9  # rad: far beyond what counters of 32 bits hold
-# Of the travel, how far the envelope lets an axis overshoot it, and the least and the most of that [rad].
+# How far the envelope lets an axis overshoot its travel: as a share of the travel, with lower and upper limit [rad].
 SLACK, SLACK_ENDS = 0.05, (0.02 * 2.0 * np.pi, 0.5 * 2.0 * np.pi)
-SPEED_SLACK = 2.0  # of the rated speed: no excitation asks for more than that, and an overshoot may
-# The same of a stepper whose encoder commutates: a trial's ramp leaves it behind, and it is faster while it catches up.
+SPEED_SLACK = 2.0  # times the rated speed: excitations stay below it, an overshoot may exceed it
+# The same for a stepper with closed loop: it lags behind a trial's ramp, and is faster while it catches up.
 CATCHING_UP = 3.0
 
 
 @dataclass(frozen=True)
 class Target:
-    """Drives to tune, and the user's knowledge of them.
+    """Drives to tune, and what the user knows of them.
 
     Attributes:
         drives: `EmulatedDrives` or `CanDrives`.
-        device: What the drives are.
-        motor: Data sheet values of what turns, of every axis.
+        device: Device of the drives.
+        motor: Data sheet values of the motor, the same for every axis.
         supply: Supply voltage as the user enters it [V], shape (num_axes,).
-        low: How far each rotor may turn backwards from where it stood when the target was made [rad], shape
-            (num_axes,), 0 or less; -infinity where it turns freely.
-        high: The same forwards, 0 or more.
-        speed: Fastest that an excitation may turn a rotor [rad/s].
-        current: Most that an excitation may ask for [A, peak i_q].
-        axes_per_machine: Axes that one machine couples; axes are machine-major.
-        linked: Whether the axes of a machine pull at one thing, as those of a gantry: none goes far without the others.
-        machine: What turns: an emulated load's name, or the channel.
-        bus: How the drives of a bus are opened again: what `CanDrives` takes; empty for emulated ones.
-        inputs: What device, motor and load hold that are its user's files, for its certificate.
+        low: Signed angle that each rotor may turn backwards from its angle when the target was made [rad], shape
+            (num_axes,), at most 0; -infinity if it may turn freely.
+        high: The same forwards, at least 0.
+        speed: Greatest speed of a rotor during excitation [rad/s].
+        current: Greatest commanded current during excitation [A, peak i_q].
+        axes_per_machine: Number of axes that one machine couples; axes are in machine-major order.
+        linked: Whether the axes of a machine move one rigid thing, as those of a gantry: none may move far without the
+            others.
+        machine: The emulated load's name, or the channel of the bus.
+        bus: Options of `CanDrives` that open the drives of a bus again; empty for emulated ones.
+        inputs: The user's own files for device, motor and load, for the certificate.
     """
 
     drives: Drives
@@ -116,20 +118,20 @@ class Target:
 
     @property
     def axis_numbers(self) -> tuple[int, ...]:
-        """Each axis' number in results: of chosen axes their number among all."""
+        """The number of each axis in results; of chosen axes their number among all."""
         return tuple(map(int, self.drives.axis_numbers))
 
     def together(self, where: Mask) -> Mask:
-        """Return which axes move where some do: of a machine whose axes pull at one thing, all or none."""
+        """Extend a mask of moving axes: of a machine with linked axes all move if one does."""
         if not self.linked:
             return where
         lanes = self.axes_per_machine
         return np.asarray(np.repeat(where.reshape(-1, lanes).any(axis=1), lanes))
 
     def slowest(self, inertia: Floats) -> Floats:
-        """Return the inertia [kg*m^2] by which axes move, (num_axes,): axes that pull at one thing move as the slowest.
+        """Return the inertia [kg*m^2] to plan motions with, shape (num_axes,): the greatest of linked axes.
 
-        Ends that went different ways would strain what they pull at.
+        Linked axes with different motions would strain the machine.
         """
         ends = (-1, self.axes_per_machine if self.linked else 1)
         return np.asarray(np.repeat(inertia.reshape(ends).max(axis=1), ends[1]))
@@ -139,16 +141,16 @@ class Target:
         return np.asarray(self.drives.read(Role.POSITION_SCALE), float) / (2.0 * math.pi)
 
     def travel_left(self, origin: Integers) -> tuple[Floats, Floats]:
-        """Return how far the rotors may turn from where they are now [rad], down and up, each (num_axes,).
+        """Return the signed angles that the rotors may still turn from here [rad], down and up, each shape (num_axes,).
 
         Args:
-            origin: Where they were when the target was made [inc], (num_axes,).
+            origin: Their positions when the target was made [inc], shape (num_axes,).
         """
         here = wrapped(self.drives.read(cia402.POSITION_ACTUAL) - origin) / self.increments()
         return np.minimum(self.low - here, 0.0), np.maximum(self.high - here, 0.0)
 
     def speed_counts(self) -> Floats:
-        """Return the counts of 606Ch and 60FFh per rad/s of every rotor, shape (num_axes,)."""
+        """Return the counts of 606Ch and 60FFh per rad/s of each rotor, shape (num_axes,)."""
         return np.asarray(self.increments() * per_increment(self.drives, cia402.VELOCITY_ACTUAL))
 
     def close(self) -> None:
@@ -159,7 +161,7 @@ class Target:
         return self
 
     def __exit__(self, *error: Any) -> None:
-        # The drives' own exit, not close(): on a bus an exception stops the axes first.
+        # Not close(): the exit of drives on a bus also stops the axes if there is an exception.
         self.drives.__exit__(*error)
 
 
@@ -177,25 +179,25 @@ def emulated(
     factory_fresh: bool = False,
     **options: Any,
 ) -> Target:
-    """Return emulated machines as a target.
+    """Create emulated machines and return them as a target.
 
     Args:
         device: Name of the device.
         load: A load's name, the path of an MJCF, or a `mechanics.Load`.
         motor: Name of the motor; the device's usual one by default.
-        num_machines: Machines, each with its drives.
+        num_machines: Number of machines, each with its drives.
         seed: Seed of everything random.
-        supply: Supply voltage [V]; the motor's by default. The machines have it, and the tuner knows it.
-        travel: How far the rotors may turn [rad], less than the load lets them: one (low, high), or one per axis of a
-            machine; the load's own by default.
-        speed: Limit of what excites [rad/s]; the motor's rated speed by default.
-        current: Limit of what excites [A]; the motor's rated current by default.
-        factory_fresh: Leave the drives as they come out of the box, all gains 0, instead of commissioned for the motor.
-        options: `chosen`, the axes of each machine that are tuned, from 0, all by default (the others stay off); and
-            what `EmulatedDrives` takes besides, such as `randomise` and `parameters`.
+        supply: Supply voltage of the machines, known to the tuner [V]; the motor's by default.
+        travel: Signed angles that the rotors may turn [rad], if less than the load allows: one (low, high), or one per
+            axis of a machine; the load's own by default.
+        speed: Greatest speed during excitation [rad/s]; the motor's rated speed by default.
+        current: Greatest current during excitation [A]; the motor's rated current by default.
+        factory_fresh: Keep the drives' factory settings, with all gains 0, instead of commissioning them for the motor.
+        options: `chosen`, the numbers (from 0) of the axes of each machine to tune, all by default (the others stay
+            off); and further options of `EmulatedDrives`, such as `randomise` and `parameters`.
 
     Raises:
-        ValueError: For an unknown name, a machine that cannot be, or a travel that does not hold 0.
+        ValueError: For an unknown name, an impossible machine, or a travel that does not contain 0.
     """
     from drive_env import EmulatedDrives
 
@@ -224,19 +226,19 @@ def of_machines(
     current: float | None = None,
     chosen: Sequence[int] | None = None,
 ) -> Target:
-    """Return emulated machines that are there already as a target.
+    """Return existing emulated machines as a target.
 
     Args:
-        drives: By which the tuner reaches them.
-        made: What they were made as: its device, motor and load count.
+        drives: Interface by which the tuner accesses the machines.
+        made: The machines; device, motor and load are taken from them.
         supply: Supply voltage [V]; the motor's by default.
-        travel: How far the rotors may turn [rad], as `emulated` takes it.
-        speed: Limit of what excites [rad/s]; the motor's rated speed by default.
-        current: Limit of what excites [A]; the motor's rated current by default.
-        chosen: Axes of each machine that are tuned, from 0; all by default. `travel` is theirs.
+        travel: Signed angles that the rotors may turn [rad], as in `emulated`.
+        speed: Greatest speed during excitation [rad/s]; the motor's rated speed by default.
+        current: Greatest current during excitation [A]; the motor's rated current by default.
+        chosen: Numbers (from 0) of the axes of each machine to tune, all by default. `travel` is of these axes.
 
     Raises:
-        ValueError: For a travel that does not hold 0, or an axis that the machines do not have.
+        ValueError: For a travel that does not contain 0, or an axis that the machines do not have.
     """
     from mechanics.shaft import one, way
     from tuning.linked_axes import are_linked
@@ -254,7 +256,7 @@ def of_machines(
     lanes = made.num_machines
     axes = np.add.outer(np.arange(lanes) * total, parts).ravel()
     here = np.asarray(made.machine.rotor_angle)[axes]
-    # The load's ends are places; a rotor that stands at one, or a little beyond, has no way to that side.
+    # The load's ends are positions: a rotor at one of them, or slightly beyond, has no travel to that side.
     low = np.maximum(np.minimum(np.tile(own.low[parts], lanes) - here, 0.0), np.tile(narrow_low, lanes))
     high = np.minimum(np.maximum(np.tile(own.high[parts], lanes) - here, 0.0), np.tile(narrow_high, lanes))
     volts = made.device.supply_of(made.motor) if supply is None else supply
@@ -286,28 +288,28 @@ def on_bus(
     axes: str = "apart",
     **options: Any,
 ) -> Target:
-    """Return the drives of a bus as a target, inside the envelope.
+    """Open drives of a bus and return them as a target with a safety envelope.
 
-    The envelope holds each axis to its own travel and a twentieth of it to either side, unless `safety` says
-    otherwise; a tuner keeps it inside, overshoot aside.
+    By default the envelope allows each axis its own travel and SLACK of it to either side; a tuner plans all motions
+    within the travel, except for overshoot.
 
     Args:
         device: Name of the device.
-        motor: Name of the motor that every node turns; the device's usual one by default.
-        interface: As python-can names it; from DRIVE_ENV_INTERFACE if not given.
-        channel: The channel; from DRIVE_ENV_CHANNEL if not given.
+        motor: Name of the motor of every node; the device's usual one by default.
+        interface: Interface as in python-can; from DRIVE_ENV_INTERFACE if not given.
+        channel: Channel; from DRIVE_ENV_CHANNEL if not given.
         nodes: Node-IDs, or positions on EtherCAT; the first one by default.
         supply: Supply voltage [V], one value or one per axis; the motor's by default.
-        travel: How far the rotors may turn from where they stand [rad]: one (low, high), or one per axis.
-        speed: Limit of what excites [rad/s]; the motor's rated speed by default.
-        current: Limit of what excites [A]; the motor's rated current by default.
-        axes: How the nodes' axes belong together, one of `AXES`; a bus does not show it.
-        options: `chosen`, the axes of each node that are tuned, from 0, all by default (the others are never
-            commanded); and what `CanDrives` takes besides.
+        travel: Signed angles that the rotors may turn from their present angle [rad]: one (low, high), or one per axis.
+        speed: Greatest speed during excitation [rad/s]; the motor's rated speed by default.
+        current: Greatest current during excitation [A]; the motor's rated current by default.
+        axes: How the nodes' axes are coupled, one of `AXES`; it cannot be read from a bus.
+        options: `chosen`, the numbers (from 0) of the axes of each node to tune, all by default (the others are never
+            commanded); and further options of `CanDrives`.
 
     Raises:
-        ValueError: For an unknown name, a travel that does not hold 0, or an axis that the device does not have;
-            BusError if a node does not answer.
+        ValueError: For an unknown name, a travel that does not contain 0, or an axis that the device does not have.
+        BusError: If a node does not answer.
     """
     check_coupling(axes)
     chosen: Sequence[int] | None = options.pop("chosen", None)
@@ -317,7 +319,7 @@ def on_bus(
 
     row = find_motor(find_device(device).default_motor if motor is None else motor)
     numbers = default_nodes(interface) if nodes is None else tuple(nodes)
-    if chosen is not None:  # before a node is asked for anything
+    if chosen is not None:  # checked before any access to a node
         chosen_parts(chosen, find_device(device).num_axes, device)
     opened = open_drives(device, interface=interface, channel=channel, nodes=numbers, **options)
     drives: Drives = opened
@@ -338,7 +340,7 @@ def on_bus(
 
 
 def of_nodes(drives: BusSide, parts: Iterable[int]) -> Drives:
-    """Return axes of every node of a bus by their numbers in it; raises as `chosen_parts` does."""
+    """Return axes of every node of a bus by their numbers in the node; raises as `chosen_parts`."""
     count = drives.description.num_axes
     chosen = chosen_parts(parts, count, drives.description.name)
     if len(chosen) == count:
@@ -357,20 +359,20 @@ def of_bus(
     current: float | None = None,
     axes: str = "apart",
 ) -> Target:
-    """Return drives of a bus that are open already as a target; `hold_to_travel` has their envelope know of it.
+    """Return opened drives of a bus as a target; call `hold_to_travel` to give its limits to their envelope.
 
     Args:
         drives: The drives.
-        motor: What every node turns.
-        address: How they are opened again: what `CanDrives` takes.
+        motor: Motor of every node.
+        address: Options of `CanDrives` that open them again.
         supply: Supply voltage [V], one value or one per axis; the motor's by default.
-        travel: How far the rotors may turn from where they stand [rad], as `on_bus` takes it.
-        speed: Limit of what excites [rad/s]; the motor's rated speed by default.
-        current: Limit of what excites [A]; the motor's rated current by default.
-        axes: How the nodes' axes belong together, one of `AXES`.
+        travel: Signed angles that the rotors may turn from their present angle [rad], as in `on_bus`.
+        speed: Greatest speed during excitation [rad/s]; the motor's rated speed by default.
+        current: Greatest current during excitation [A]; the motor's rated current by default.
+        axes: How the nodes' axes are coupled, one of `AXES`.
 
     Raises:
-        ValueError: For a travel that does not hold 0.
+        ValueError: For a travel that does not contain 0.
     """
     check_coupling(axes)
     low, high = _ways(travel, drives.num_axes)
@@ -387,22 +389,22 @@ def of_bus(
 
 
 def check_coupling(axes: str) -> None:
-    """Raise ValueError for a word that is not one of `AXES`."""
+    """Raise ValueError unless the word is one of `AXES`."""
     if axes not in AXES:
         raise ValueError(f"--axes {axes} must be one of {', '.join(AXES)}")
 
 
 @contextmanager
 def timed(target: Target) -> Iterator[tuple[Target, DriveTime]]:
-    """Give the target with drives whose time, emergencies and SYNCs are kept in mind, and the clock of the time.
+    """Yield the target with drives that remember time, emergencies and SYNCs, and the clock of this time.
 
-    An error of the envelope or of a motion names late SYNCs before its own reason.
+    An error of the envelope or of a motion raised in the block then names late SYNCs before its own reason.
     """
     clock = DriveTime()
     drives = ObservedDrives(target.drives, clock, ToldCauses(target.num_axes), Punctuality(target.drives))
     try:
         yield replace(target, drives=drives), clock
-    except (RuntimeError, TimeoutError) as error:  # the envelope's, and those of motion
+    except (RuntimeError, TimeoutError) as error:  # raised by the envelope and by motion
         if error.args and isinstance(error.args[0], str):
             error.args = (late_first(drives, error.args[0]), *error.args[1:])
         raise
@@ -412,19 +414,19 @@ class DriveTime(Observer):
     """Counts the time that passes on drives: the cost of a tuner on hardware.
 
     Attributes:
-        seconds: Time that passed so far [s].
+        seconds: Time so far [s].
     """
 
     def __init__(self) -> None:
         self.seconds = 0.0
 
     def passes(self, duration: float) -> None:
-        """Count it."""
+        """Add the duration to `seconds`."""
         self.seconds += duration
 
 
 def _ways(travel: Travel | Iterable[Travel], num_axes: int) -> tuple[Floats, Floats]:
-    """Return lower and upper ends [rad] of the axes from one range for all or one for each, (num_axes,) each."""
+    """Return lower and upper ends of travel [rad], shape (num_axes,) each, from one range for all or one per axis."""
     ways = np.asarray(list(travel), float)
     if ways.shape not in ((2,), (num_axes, 2)):
         raise ValueError(
@@ -452,7 +454,7 @@ def _limits(
 def address_of(
     interface: str | None, channel: str | None, nodes: tuple[int, ...], options: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return the options that open these drives again, without those that a file cannot hold, such as an open bus."""
+    """Return the options that open these drives again, without those that a file cannot store, such as an open bus."""
     from drive_env.master.can.port import CHANNEL_VARIABLE, INTERFACE_VARIABLE
 
     found = {
@@ -467,7 +469,7 @@ _ADDRESS = ("bitrate", "pace")
 
 
 def hold_to_travel(target: Target) -> None:
-    """Have the envelope hold each axis to its own travel, by more than a move overshoots, and to its motor's speed."""
+    """Limit the envelope to each axis' travel, with room for overshoot, and to the speed of its motor."""
     from drive_env.drives.limits import Limits
 
     drives = target.drives

@@ -1,4 +1,4 @@
-"""Strict reading of TOML tables into dataclasses, and writing them back: every mistake is one line with its remedy."""
+"""Strict conversion between TOML tables and dataclasses: every mistake is reported in one line with its remedy."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 
 class ExperimentError(ValueError):
-    """The experiment is impossible; the message has key, value, limit and remedy."""
+    """The experiment is invalid; the message has key, value, limit and remedy."""
 
 
 _KINDS: dict[str, tuple[type, str]] = {"str": (str, "a text"), "int": (int, "a whole number"),
@@ -18,7 +18,7 @@ _KINDS: dict[str, tuple[type, str]] = {"str": (str, "a text"), "int": (int, "a w
 
 
 def read_table(where: str, table: Any, kind: type, optional: Collection[str] = ()) -> dict[str, Any]:
-    """Return the values of a table by the fields of a dataclass."""
+    """Check a table against the fields of a dataclass and return its values."""
     table = as_table(where, table)
     types = {f.name: str(f.type).removesuffix(" | None") for f in fields(kind)}
     check_keys(where, table, list(types), optional)
@@ -36,14 +36,14 @@ def check_keys(where: str, table: Mapping[str, Any], known: list[str], optional:
 
 
 def as_table(where: str, value: Any) -> dict[str, Any]:
-    """Return a value that is a table."""
+    """Check that a value is a table and return it."""
     if not isinstance(value, dict):
         raise ExperimentError(f"{where} is {kind_of(value)}; it must be a table")
     return value
 
 
 def as_value(where: str, value: Any, kind: str) -> Any:
-    """Return a value of the kind; a whole number is a number too, a truth value is not."""
+    """Check the kind of a value and return it; "float" accepts whole numbers, no kind accepts booleans."""
     wanted, meaning = _KINDS[kind]
     if wanted is float and type(value) is int:
         value = float(value)
@@ -55,20 +55,20 @@ def as_value(where: str, value: Any, kind: str) -> Any:
 
 
 def kind_of(value: Any) -> str:
-    """Return the kind of a TOML value, in words."""
+    """Return the kind of a TOML value for messages."""
     names = {bool: "a truth value", int: "a whole number", float: "a number with a fraction", str: "a text",
              list: "an array", dict: "a table"}  # fmt: skip
     return names.get(type(value), f"a {type(value).__name__}")
 
 
 def toml_lines(record: Any) -> list[str]:
-    """Return the lines of a table with the fields of a dataclass; None is left out."""
+    """Write the fields of a dataclass as lines of a TOML table; fields that are None are omitted."""
     values = {f.name: getattr(record, f.name) for f in fields(record)}
     return [f"{name} = {toml(value)}" for name, value in values.items() if value is not None]
 
 
 def toml(value: Any) -> str:
-    """Return a value as TOML; a float with all its digits, what TOML does not have, as a path, as text."""
+    """Write a value as TOML: a float with all its digits; a value without TOML type, such as a path, as text."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, list | tuple):

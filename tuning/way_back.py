@@ -1,6 +1,6 @@
-"""The last lines of a command that changes drives of a bus: the changes that are left, and the line that restores.
+"""The last lines of a command that changes drives of a bus: the remaining changes, and the command that restores.
 
-It is not what the run believes: the drives are opened anew, once the run has closed them, and compared with the file.
+They are measured, not assumed: after the run has closed the drives, they are opened again and compared with the file.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from tuning.target import LOCKSTEP_PATIENCE
 
 @contextmanager
 def way_back(file: Path | None, program: str) -> Iterator[None]:
-    """Print on stderr, if a block that changes drives fails, the changes that are left and the line that restores.
+    """Print on stderr, if a block that changes drives fails, the remaining changes and the command that restores them.
 
     Args:
-        file: The file with the state before, which the block writes before it changes anything; None for emulated
-            drives, which end with the program. The block opens the drives and closes them: only then is given back
-            what they borrowed.
-        program: Who speaks on stderr.
+        file: The file with the state before, which the block writes before its first change; None for emulated drives,
+            which end with the program. The block must open and close the drives itself: closing restores what they
+            borrowed.
+        program: Name of the program for the message.
     """
     try:
         yield
@@ -40,11 +40,11 @@ def way_back(file: Path | None, program: str) -> Iterator[None]:
 
 
 def what_is_changed(file: Path) -> str:
-    """Ask drives of a bus anew; return a message of the differences from a file of the state before.
+    """Read drives of a bus again; return a message with the differences from a file of the state before.
 
-    A node that is silent is not woken: it may be stopping by itself (docs/safety.md).
+    A node that does not answer is not woken: it may be stopping by itself (docs/safety.md).
     """
-    with held_signals():  # a second Ctrl-C would hide the line that matters
+    with held_signals():  # a second Ctrl-C would suppress the line that matters
         try:
             found = read_anew(load_snapshot(file))
         except (BusError, ObjectAccessError, OSError, RuntimeError, ValueError) as error:
@@ -61,11 +61,11 @@ def what_is_changed(file: Path) -> str:
     return f"changed still: {', '.join(told)}{more}; drive-tune undo {file} restores the state before"
 
 
-TOLD = 5  # differences that a line names
+TOLD = 5  # differences listed in one line
 
 
 def read_anew(snapshot: Snapshot) -> list[tuple[int, Difference]]:
-    """Read the drives of a snapshot anew; return their `differences`; raise if they do not answer."""
+    """Open the drives of a snapshot again and return their `differences`; raise if they do not answer."""
     address = {name: value for name, value in snapshot.bus.items() if name != "axes"}
     if address.get("pace") == "lockstep":
         address["timeout"] = LOCKSTEP_PATIENCE

@@ -1,4 +1,4 @@
-"""The part of the page Tune that has a trained agent tune the axes, trial by trial."""
+"""The part of the page Tune in which a trained agent tunes the axes, trial by trial."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from tuning.studio.tuner_card import TunerCard
     from tuning.target import Target
 
-TRIALS_SHARE = (0.3, 0.68)  # of a run's progress: where its trials begin and end
+TRIALS_SHARE = (0.3, 0.68)  # shares of a run's progress at which its trials begin and end
 
 
 def build(card: TunerCard) -> None:
-    """Make it into the card of tuners."""
+    """Add the agent's controls to the card of tuners."""
     from agents.shipped import TUNER
     from agents.tuner.open_tuner import open_tuner
 
@@ -51,14 +51,14 @@ def build(card: TunerCard) -> None:
 
 
 def columns_of(device: str) -> tuple[str, ...]:
-    """Return the titles of a trial's columns."""
+    """Return the column titles of the table of trials."""
     from agents.tuner.open_tuner import titles_of_trials
 
     return ("Trial", *titles_of_trials(find_device(device).gains), "J (less is better)", "")
 
 
 def work_of(policy: Any, name: str, store: bool) -> Callable[[Target, TunerSession, Callable[[str, float], None]], Any]:
-    """Return the agent's work: that of `drive-tune auto --by agent`, its files in the run's folder."""
+    """Return the function that runs the agent like `drive-tune auto --by agent`, with its files in the run's folder."""
 
     def work(target: Target, run: TunerSession, progress: Callable[[str, float], None]) -> Any:
         from agents.tuner.known_range import outside

@@ -1,4 +1,4 @@
-"""The part of the page Runs that draws learning curves of a training, also while it is under way."""
+"""The part of the page Runs that draws learning curves of a training, also while it runs."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from agents.studio.event_curves import Curves, read_curves
 from drive_env.studio import charts
 from drive_env.studio.parts import StudioPart
 
-REFRESH = 5.0  # s between two looks at a training that is under way
+REFRESH = 5.0  # s between two readings of a running training
 FIRST = ("rollout/ep_rew_mean", "rollout/return", "eval/mean_reward", "return")
 
 
 def first_tag(tags: list[str]) -> str | None:
-    """Return the curve that people look for first: the return."""
+    """Return the tag of the curve shown first: a return if there is one, else the first tag, None without tags."""
     return next((tag for tag in FIRST if tag in tags), tags[0] if tags else None)
 
 
 def curve_chart(curves: Curves, tags: list[str]) -> dict[str, Any]:
-    """Return the chart of some curves, a panel for each."""
+    """Return the options of a chart with one panel per curve."""
     panels = [charts.ChartPanel(tag) for tag in tags]
     lines = [charts.ChartLine(tag, *curves[tag], panel=k, colour=k) for k, tag in enumerate(tags)]
     return charts.options(panels or [charts.ChartPanel("")], "steps of all environments", lines)
 
 
 def build(folder: Path) -> None:
-    """Make it for the folder of a run."""
+    """Add the learning curves of a run's folder to the page."""
     ui.label("Learning curves").classes("studio-heading").props('role="heading" aria-level="3"')
     chosen = ui.select([], multiple=True, label="Curves").props("dense outlined use-chips data-test=curve-tags")
     chosen.classes("w-full")

@@ -9,19 +9,20 @@ from pathlib import Path
 from mechanics.reading.untrusted import MOST_RECORDING, check_size
 
 EVENTS = "events.out.tfevents."
-MOST_POINTS = 20_000  # of a curve that are read
-MOST_CURVES = 200  # that are read
+MOST_POINTS = 20_000  # that are read of a curve
+MOST_CURVES = 200  # that are read of a folder
 
 Curves = Mapping[str, tuple[list[int], list[float]]]
 
 
 def read_curves(folder: Path) -> Curves:
-    """Return each scalar of a folder's event files by its tag: steps, and values.
+    """Read the scalars of a folder's event files as {tag: (steps, values)}.
 
-    A file whose end is being written is read up to there; links, pipes and files beyond the limits are left out.
+    A file that is still being written is read up to its last complete event; links, pipes and files above the size
+    and number limits are skipped.
 
     Raises:
-        ImportError: If TensorBoard, of the extra `agents`, is not installed.
+        ImportError: If TensorBoard (extra `agents`) is not installed.
     """
     from tensorboard.backend.event_processing.event_file_loader import LegacyEventFileLoader
 
@@ -44,14 +45,14 @@ def read_curves(folder: Path) -> Curves:
 
 
 def _scalars(loader: object) -> Iterator[tuple[int, str, float]]:
-    """Give step, tag and value of each scalar of a file."""
+    """Yield step, tag and value of each scalar of a file."""
     events = loader.Load()  # type: ignore[attr-defined]
     while True:
         try:
             event = next(events)
         except StopIteration:
             return
-        except Exception:  # whatever a broken file makes of the protocol: what came before it is good
+        except Exception:  # a broken file can raise anything; the events before the error are good
             return
         for one in event.summary.value:
             if one.HasField("simple_value"):

@@ -1,4 +1,4 @@
-"""Effects of the machines' faults: rows of quantities, each with its value under the fault by its value without."""
+"""Effects of the machines' faults: the quantities that a fault changes, each with a function from its normal value."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ class Quantity(NamedTuple):
     """A quantity that a fault changes.
 
     kind: "record", a field of the drives' records, one per axis; "load", a parameter of the load, one per machine;
-        "jam", what holds the load [N*m at the rotor], one per axis.
-    name: Of the field or parameter.
-    part: In a deep field.
+        "jam", the torque that holds the load [N*m at the rotor], one per axis.
+    name: Name of the field or parameter.
+    part: Index in a field of the record that holds several values per axis.
     """
 
     kind: str
@@ -27,7 +27,7 @@ class Quantity(NamedTuple):
 
 
 class Change(NamedTuple):
-    """A quantity, and its value under the fault: (value without, parameters of the fault, rated torque [N*m])."""
+    """A quantity and its value under the fault: value(normal value, fault parameters, rated torque [N*m])."""
 
     quantity: Quantity
     value: Callable[[Floats, Given, float], Floats]
@@ -65,14 +65,14 @@ def _multiplied(sound: Floats, given: Given, rated: float) -> Floats:
     return sound * given["factor"]
 
 
-# Fields of the record that a DC link has once, whichever of its axes is named.
+# Fields of the record that belong to the DC link: one value for all axes of a drive, whichever axis the fault names.
 OF_LINK = ("supply_voltage", "short_conductance")
 ENCODER_GAIN = Quantity("record", "encoder_gain")
 ENCODER_DIRECTION = Quantity("record", "encoder_true_direction")
 ENCODER_NOISE = Quantity("record", "encoder_noise")
 
-# Of a row's fields a drive has those that its firmware has (`of_drives`). Temperatures act on R_s and psi_m each
-# millisecond, so what is changed is their value at 25 degC.
+# A fault changes those of its fields that the drive's firmware has (`of_drives`). R_s and psi_m follow the temperature
+# each millisecond, so a fault changes their value at 25 degC.
 CHANGES: dict[str, tuple[Change, ...]] = {
     "encoder_lost_counts": (Change(ENCODER_GAIN, lambda sound, given, rated: sound * (1.0 - given["share"])),),
     "encoder_stuck": (Change(ENCODER_GAIN, _vanished),),
@@ -89,7 +89,7 @@ CHANGES: dict[str, tuple[Change, ...]] = {
     "supply_dip": (_record("supply_voltage", lambda sound, given, rated: np.minimum(sound, given["voltage"])),),
     "supply_surge": (_record("supply_voltage", lambda sound, given, rated: np.maximum(sound, given["voltage"])),),
     "brake_stuck": (_record("brake_mode", _broken),),
-    # Pressed wherever the load is.
+    # The switch is pressed at any position of the load.
     "limit_switch": tuple(
         _record(name, _pressed(number, end), number)
         for number in (0, 1)
@@ -98,24 +98,24 @@ CHANGES: dict[str, tuple[Change, ...]] = {
     "enable_lost": (_record("enable_input", _vanished),),
     "jam": (Change(Quantity("jam"), lambda sound, given, rated: sound + given["torque"] * rated),),
     "broken_coupling": tuple(Change(Quantity("load", name), _vanished) for name in ("stiffness", "damping")),
-    # Of the first that the load has (payload_of).
+    # Only the first of these that the load has is changed (payload_of).
     "payload_jump": tuple(Change(Quantity("load", name), _multiplied) for name in ("payload", "mass", "inertia")),
 }
-# A moment, not a state: what MachineFaults does at once.
+# Faults without duration: MachineFaults applies them once.
 MOMENTS = ("encoder_jump", "node_reset")
 
 
 def of_drives(name: str, changes: tuple[Change, ...], fields: Collection[str], device: str) -> tuple[Change, ...]:
-    """Return those of a fault's changes that drives can have.
+    """Return the changes of a fault that apply to drives with these record fields.
 
     Args:
-        name: The fault.
-        changes: All of it.
-        fields: Fields of the drives' records.
-        device: What the drives are, for the message.
+        name: Name of the fault.
+        changes: All changes of the fault.
+        fields: Names of the fields of the drives' records.
+        device: Name of the device, for the message.
 
     Raises:
-        ValueError: If it changes nothing that these drives or their motors have.
+        ValueError: If no change applies to these drives and their motors.
     """
     found = tuple(one for one in changes if one.quantity.kind != "record" or one.quantity.name in fields)
     if not found:
@@ -129,14 +129,14 @@ def changes_of(
     """Return the changes that a fault makes to a machine.
 
     Args:
-        name: The fault.
+        name: Name of the fault.
         load_parameters: Names of the load's parameters.
         load: Name of the load, for messages.
-        num_axes: Axes of a machine.
+        num_axes: Number of axes of a machine.
         has_switches: Whether the load has limit switches.
 
     Raises:
-        ValueError: If the load does not have what the fault changes.
+        ValueError: If the load lacks the property that the fault changes.
     """
     changes = CHANGES[name]
     if name == "broken_coupling" and (num_axes > 1 or "stiffness" not in load_parameters):

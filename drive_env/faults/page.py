@@ -1,4 +1,4 @@
-"""docs/faults.md from the table of faults: `python -m drive_env.faults.page docs/faults.md` writes it anew."""
+"""Writes docs/faults.md from the table of faults: `python -m drive_env.faults.page docs/faults.md`."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ a following error window (6065h) of 0.46 revolutions; on a bus, with a master's 
 
 
 def page() -> str:
-    """Return the page."""
+    """Return the text of the page."""
     parts = [INTRODUCTION]
     for group in GROUPS:
         rows = [row for row in FAULTS.values() if row.group == group]
@@ -79,7 +79,7 @@ def page() -> str:
 def _line(row: FaultRow) -> str:
     if row.emergency is None or row.detection is None:
         return f"| [{row.name}](#{row.name}) | nothing | not by the drive |"
-    rows = find_device(DEFAULT_DEVICE).emergencies  # whose reactions the table has
+    rows = find_device(DEFAULT_DEVICE).emergencies  # the table gives this device's reactions
     name = next(name for name, one in rows.items() if one.code == row.emergency)
     said = f"{row.emergency:04X}h, {name.replace('_', ' ')}"
     return f"| [{row.name}](#{row.name}) | {said} | {row.detection * 1e3:g} ms |"
@@ -102,7 +102,7 @@ def _section(row: FaultRow) -> str:
 
 
 def _elsewhere(row: FaultRow, firmware: str) -> str:
-    """Return the line of what drives of another firmware make of a fault."""
+    """Return the line about the reaction of drives with another firmware."""
     other = row.on_firmware(firmware)
     assert other is not None
     names = ", ".join(f"`{name}`" for name in device_names() if find_device(name).firmware_name == firmware)
@@ -110,7 +110,7 @@ def _elsewhere(row: FaultRow, firmware: str) -> str:
 
 
 def main() -> None:
-    """Write the page to the file that is named, or print it."""
+    """Write the page to the file named on the command line, or print it."""
     if len(sys.argv) > 1:
         Path(sys.argv[1]).write_text(page(), encoding="utf-8")
     else:

@@ -1,4 +1,4 @@
-"""When a fault begins and ends: after a time or a condition, for a duration or for ever; also as one line of text."""
+"""Begin and end of a fault: after a time or on a condition, for a duration or for ever; and its form as one line."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ _WORDS = ("at", "when", "duration", "node", "axis")
 
 @dataclass(frozen=True)
 class Condition:
-    """The condition of a fault, on the axes that it is of; any of them will do.
+    """The condition of a fault; true if it holds on any axis of the fault.
 
-    quantity: "enabled": operation enabled. "position": true rotor angle [rad]; "speed": its rate without its sign
-        [rad/s]; these are compared with `limit`. "" means none.
-    above: Whether it has to be above the limit, or below.
+    quantity: "enabled": operation enabled. "position": true rotor angle [rad]; "speed": magnitude of the true rotor
+        speed [rad/s]; both are compared with `limit`. "" means no condition.
+    above: True if the quantity must be above the limit, False if below.
     """
 
     quantity: str = NO_CONDITION
@@ -30,7 +30,7 @@ class Condition:
 
     @classmethod
     def parse(cls, text: str) -> Condition:
-        """Parse `when`: "enabled", or a comparison such as "speed > 100" or "position < -3.5".
+        """Parse a condition: "enabled", or a comparison such as "speed > 100" or "position < -3.5".
 
         Raises:
             ValueError: For any other text.
@@ -50,12 +50,12 @@ class Condition:
         return cls(match[1], match[2] == ">", limit)
 
 
-NEVER = 2**62  # a cycle that does not come
+NEVER = 2**62  # a cycle number that is never reached
 
 
 @dataclass(frozen=True)
 class Order:
-    """One fault that is asked for, as `machine.fault` takes it; on a bus `axis` is one of its `node`."""
+    """A requested fault, as `machine.fault` takes it; on a bus `axis` is the number of the axis in its `node`."""
 
     name: str
     at: float = 0.0
@@ -67,10 +67,10 @@ class Order:
 
 
 def cycles_of(order: Order, row: FaultRow, cycles: Callable[[float], int]) -> tuple[int, int]:
-    """Return delay and length of a fault in communication cycles; `cycles` counts them in a time [s].
+    """Convert delay and duration of a fault to communication cycles; `cycles` converts a time [s].
 
     Raises:
-        ValueError: For times that are not whole cycles, or a duration of a fault that is a moment.
+        ValueError: If a time is not a whole number of cycles, or a fault without duration is given one.
     """
     if order.duration is not None and row.once:
         raise ValueError(f"fault {row.name} is a moment and has no duration; leave duration out")
@@ -81,10 +81,10 @@ def cycles_of(order: Order, row: FaultRow, cycles: Callable[[float], int]) -> tu
 
 
 def parse_order(text: str) -> Order:
-    """Parse one line as an order: a name, then as at=2 duration=0.1 when="speed > 100" node=1 share=0.2.
+    """Parse one line of text: the fault's name, then at=2 duration=0.1 when="speed > 100" node=1 share=0.2.
 
     Raises:
-        ValueError: For a line that cannot be understood; the values are checked where the order is taken.
+        ValueError: If the syntax is wrong; the values themselves are checked by `machine.fault`.
     """
     try:
         words = shlex.split(text)

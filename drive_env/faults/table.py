@@ -11,7 +11,7 @@ from typing import Any
 from mechanics.reading.near_names import did_you_mean
 from mechanics.reading.untrusted import read_toml
 
-OWN = "servo"  # the firmware of the drive whose reactions the rows have
+OWN = "servo"  # the firmware whose reactions the rows describe
 STEPS = {
     "end": "Remove the cause",
     "start_node": "Start the node (NMT)",
@@ -24,7 +24,7 @@ GROUPS = ("sensor", "motor", "supply", "load", "bus", "node")
 
 @dataclass(frozen=True)
 class FaultParameter:
-    """A number of a fault: default, lowest and highest value, unit, and meaning."""
+    """A parameter of a fault: default, lowest and highest value, unit, and meaning."""
 
     default: float
     low: float
@@ -34,15 +34,15 @@ class FaultParameter:
 
     @property
     def range(self) -> str:
-        """From its lowest to its highest value, as text; a share has no unit."""
+        """Range of allowed values as text; a share (unit "1") is given without unit."""
         return f"{self.low:g} to {self.high:g}" + ("" if self.unit == "1" else f" {self.unit}")
 
 
 @dataclass(frozen=True)
 class FaultRow:
-    """A fault; table.toml explains each field. `emergency` is None where the drive does not detect it.
+    """A fault; table.toml explains each field. `emergency` is None if the drive does not detect the fault.
 
-    Its reaction is that of one drive; `on_firmware` has those of others.
+    The reaction described is that of `OWN` firmware; `on_firmware` returns that of another.
     """
 
     name: str
@@ -62,11 +62,11 @@ class FaultRow:
 
     @property
     def way_back(self) -> str:
-        """The steps of the way back as sentences, and what they leave out."""
+        """The steps that end the fault, as sentences, followed by `recovery`."""
         return " ".join([*(f"{STEPS[step]}." for step in self.steps), self.recovery]).strip()
 
     def on_firmware(self, name: str) -> FaultRow | None:
-        """Return the row as it holds for drives of a firmware; None if it is not known what they make of it."""
+        """Return the row with the reaction of another firmware; None if the table has no reaction for it."""
         if name == OWN:
             return self
         if name not in self.on:
@@ -89,10 +89,10 @@ FAULTS = _rows()
 
 
 def find_fault(name: str) -> FaultRow:
-    """Return the row of a fault.
+    """Look up the row of a fault.
 
     Raises:
-        ValueError: For an unknown name, with the known ones.
+        ValueError: If the name is unknown; the message lists the known ones.
     """
     if name not in FAULTS:
         raise ValueError(f"no fault is named {name!r}; there are {', '.join(FAULTS)}{did_you_mean(name, FAULTS)}")
@@ -100,10 +100,10 @@ def find_fault(name: str) -> FaultRow:
 
 
 def names_of(chosen: str) -> tuple[str, ...]:
-    """Return the faults of a group, or the one of that name.
+    """Return the names of a group's faults, or the one fault of that name.
 
     Raises:
-        ValueError: If it is neither.
+        ValueError: If it is neither a group nor a fault.
     """
     if chosen in GROUPS:
         return tuple(row.name for row in FAULTS.values() if row.group == chosen)
@@ -116,10 +116,10 @@ def names_of(chosen: str) -> tuple[str, ...]:
 
 
 def checked_parameters(row: FaultRow, given: Mapping[str, float]) -> dict[str, float]:
-    """Return all parameters of a fault, those that are not given at their defaults.
+    """Check parameters of a fault and fill in defaults.
 
     Raises:
-        ValueError: For one that the fault does not have, or a value out of its range.
+        ValueError: If the fault has no such parameter, or a value is outside its range.
     """
     for name, value in given.items():
         if name not in row.parameters:

@@ -21,7 +21,7 @@ from drive_env.studio.state_diagram import ARROWS, diagram
 from drive_env.studio.visitor import Visitor
 
 REFRESH = 0.1  # s
-BITS = (  # of the statusword, that people ask for
+BITS = (  # of the statusword, shown to users
     ("Target reached", cia402.TARGET_REACHED),
     ("Internal limit active", cia402.INTERNAL_LIMIT),
     ("Warning", cia402.WARNING),
@@ -30,7 +30,7 @@ BITS = (  # of the statusword, that people ask for
 
 
 def build(session: Session, visitor: Visitor) -> None:
-    """Make the page."""
+    """Build the page."""
     if session.num_axes > 1:
         group_card(session, visitor)
     with ui.element("div").classes("studio-grid"):
@@ -83,7 +83,7 @@ def _state_card(session: Session, visitor: Visitor) -> None:
 
 
 def _single_transitions(state: State | None) -> None:
-    """Make a button for each transition that leaves a state by a command."""
+    """Build a button for each transition that leaves a state by a command."""
     leaving = [arrow for arrow in ARROWS if arrow.start is state and arrow.word is not None]
     for arrow in leaving:
         button = ui.button(f"{arrow.numbers} {arrow.name}").props("outline no-caps dense").classes("studio-transition")
@@ -120,21 +120,21 @@ def _motion_card(session: Session, visitor: Visitor) -> None:
 
 
 def _show_share(label: ui.label, share: float | None) -> None:
-    """Show the share of its limit that a current is, in colour and with a sign at the limit; nothing for None."""
+    """Show a current as a share of its limit, with colour and sign at the limit; nothing for None."""
     is_at = share is not None and share >= SHARE
     label.classes(add="is-at" if is_at else "", remove="" if is_at else "is-at")
     label.set_text("" if share is None else f"{'▲ ' if is_at else ''}Current: {100.0 * share:.0f} % of its limit")
 
 
 class _Values:
-    """A list of quantities that are shown, each with its label and unit."""
+    """A list of displayed quantities, each with label and unit."""
 
     def __init__(self) -> None:
         self._box = ui.element("div").classes("studio-values")
         self._rows: dict[str, tuple[ui.label, ui.label]] = {}
 
     def show(self, quantities: tuple[ShownQuantity, ...]) -> None:
-        """Show quantities; the labels of new ones are added."""
+        """Show quantities; labels of new ones are added."""
         for one in quantities:
             if one.label not in self._rows:
                 with self._box:

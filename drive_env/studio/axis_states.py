@@ -1,4 +1,4 @@
-"""The state of every axis, for people: mode, motion, faults, switches, temperatures."""
+"""The state of every axis for display: mode, motion, faults, switches, temperatures."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from drive_env.studio.recorder import ScopeRecorder
 if TYPE_CHECKING:
     from drive_env.fieldbus.description import Description
 
-SLOW = 0.5  # s between two readings of what changes slowly
-QUICK = 0.08  # s between two pictures of what is sampled
+SLOW = 0.5  # s between two readings of slowly changing values
+QUICK = 0.08  # s between two evaluations of sampled values
 SAMPLED = (
     cia402.STATUSWORD, cia402.POSITION_ACTUAL, cia402.VELOCITY_ACTUAL, cia402.VL_VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL
 )  # fmt: skip
@@ -39,7 +39,7 @@ NO_FAULT = ("fault_reset", "error_reset")
 
 @dataclass(frozen=True)
 class ShownQuantity:
-    """An object's value for display: label, number, unit; the number is None if it is not known."""
+    """An object's value for display: label, number, unit; the number is None if it is unknown."""
 
     label: str
     value: float | None
@@ -54,7 +54,7 @@ class ShownQuantity:
 
 @dataclass(frozen=True)
 class AxisFault:
-    """An emergency that stands: its code, its text, and when it came (time of day [s])."""
+    """An active emergency: its code, its text, and its time (time of day [s])."""
 
     code: int
     text: FaultText
@@ -63,22 +63,22 @@ class AxisFault:
 
 @dataclass(frozen=True)
 class AxisState:
-    """The present knowledge of an axis.
+    """The known state of an axis.
 
     Attributes:
-        axis: Its number, from 0.
-        name: What people call it.
+        axis: Number of the axis, from 0.
+        name: Name for display.
         status: Statusword 6041h.
-        state: That it shows; None where it shows none, or nothing was read yet.
-        mode: Mode of operation by its abbreviation; "" for none.
-        modes: Those that the drive has.
-        motion: Position, velocity, current as they are.
+        state: State in the statusword; None if it is invalid, or not read yet.
+        mode: Abbreviation of the mode of operation; "" without one.
+        modes: Modes that the drive has.
+        motion: Actual position, velocity, current.
         faults: Emergencies since the last reset.
         inputs: Switches by name, and whether they are active.
-        slow: Temperatures, DC link and the like.
-        is_at_limit: Whether its current is at the limit though it does not turn.
-        current_share: Share of the limit that its current is; None where the drive tells no limit.
-        is_silent: Whether its node sends no process data: it has left operational, or is gone.
+        slow: Temperatures, DC link and similar values.
+        is_at_limit: Whether its current is at the limit although it does not turn.
+        current_share: Current over its limit; None if the drive has no limit object.
+        is_silent: Whether its node sends no process data: it left operational, or is not reachable.
     """
 
     axis: int
@@ -97,7 +97,7 @@ class AxisState:
 
     @property
     def is_enabled(self) -> bool:
-        """Whether it is in operation enabled."""
+        """Whether it is in "operation enabled"."""
         return self.state is State.OPERATION_ENABLED
 
     @property
@@ -107,26 +107,26 @@ class AxisState:
 
     @property
     def is_in_fault(self) -> bool:
-        """Whether it is in fault."""
+        """Whether it is in fault or in its fault reaction."""
         return self.state in (State.FAULT, State.FAULT_REACTION_ACTIVE)
 
     def has_bit(self, pattern: tuple[int, int]) -> bool:
-        """Return whether its statusword shows a pattern."""
+        """Return whether its statusword matches a pattern."""
         return bool(cia402.matches(self.status, pattern))
 
 
 class AxisStates:
-    """Keeps the present knowledge of the axes; refreshed by the thread of the drives, read by any.
+    """The known states of the axes; refreshed by the drives' thread, read by any thread.
 
     Args:
         drives: The drives.
-        description: Of their device.
-        units: In which values of each dimension are shown; they may change.
+        description: Description of the device.
+        units: Displayed unit of each dimension; they may change.
 
     Attributes:
-        axes: What is known, replaced as a whole.
-        scales: What the units of each axis follow.
-        sampled: Objects that are wanted of each cycle, the most important first.
+        axes: The states; replaced as a whole.
+        scales: Scales of each axis' units.
+        sampled: Objects to sample in each cycle, the most important first.
     """
 
     def __init__(self, drives: Drives, description: Description, units: Mapping[str, str] = SHOWN) -> None:
@@ -141,7 +141,7 @@ class AxisStates:
         self._slow_entries = [entry for entry in description.dictionary if _is_slow(entry, description)]
         self._unreadable: set[Key] = set()
         self._limit_key = description.role(Role.CURRENT_LIMIT)
-        self._limit: Any = None  # of the current, shape (num_axes,); None where the drive tells none
+        self._limit: Any = None  # current limit, shape (num_axes,); None if the drive has no such object
         self._pushing = LimitAtRest(drives)
         modes = self._modes(drives)
         self.axes: tuple[AxisState, ...] = tuple(
@@ -160,7 +160,7 @@ class AxisStates:
         return []
 
     def hear(self, message: EmergencyMessage) -> tuple[str, str]:
-        """Note an emergency; return its severity and its text."""
+        """Store an emergency; return its severity and its text."""
         text = fault_text(message.name)
         axis = self.axes[message.axis]
         if message.code == 0 or message.name in NO_FAULT:
@@ -172,21 +172,21 @@ class AxisStates:
         return "error", f"{axis.name}: {message.code:04X}h {text.name}. {text.cause} {text.remedy}"
 
     def forget_faults(self, axis: int) -> None:
-        """Note that the faults of an axis were reset."""
+        """Remove the faults of an axis, which were reset."""
         self._replace(axis, faults=())
 
     def lose(self, silent: Sequence[int]) -> None:
-        """Note that nothing came from the drives, so that no state is known; `silent` are the nodes that are why."""
+        """Mark all states as unknown, since the drives did not answer; `silent` are the nodes that caused it."""
         for axis in self.axes:
             is_silent = axis.axis // self._known.num_axes in silent
             self._replace(axis.axis, status=0, state=None, is_silent=is_silent)
 
-    # --- inside ---------------------------------------------------------------------------------------------------
+    # --- private methods ------------------------------------------------------------------------------------------
     def _replace(self, axis: int, **changes: Any) -> None:
         self.axes = tuple(replace(one, **changes) if one.axis == axis else one for one in self.axes)
 
     def _modes(self, drives: Drives) -> tuple[str, ...]:
-        """Return the modes that the drive says it has, by 6502h; all where it does not say."""
+        """Return the modes that the drive supports by 6502h; all if it lacks the object."""
         every = tuple(cia402.MODES)
         try:
             bits = int(drives.read((cia402.SUPPORTED_MODES, 0))[0])
@@ -206,7 +206,7 @@ class AxisStates:
         return self._note_limits(newest)
 
     def _note_limits(self, newest: Mapping[Key, Any]) -> list[str]:
-        """Note axes at their current limit that do not turn; return messages about new ones."""
+        """Detect axes at their current limit that do not turn; return messages about new ones."""
         current, speed = newest.get((cia402.TORQUE_ACTUAL, 0)), newest.get((cia402.VELOCITY_ACTUAL, 0))
         if self._limit is None or current is None or speed is None:
             return []
@@ -238,7 +238,7 @@ class AxisStates:
             self._replace(axis, mode=mode, inputs=switches, slow=values)
 
     def _try(self, drives: Drives, key: Key) -> Any:
-        """Return an object of every axis, None if the drive does not have it."""
+        """Read an object of every axis; None if the drive does not have it."""
         if key in self._unreadable:
             return None
         try:
@@ -252,7 +252,7 @@ class AxisStates:
 
 
 def quantity_of(entry: Entry, raw: int, scale: Scale, units: Mapping[str, str]) -> ShownQuantity:
-    """Return an integer of an object in the unit of its dimension."""
+    """Convert an integer of an object to the displayed unit of its dimension."""
     unit = find_unit(entry.unit, scale)
     if unit is None:
         return ShownQuantity(entry.name, float(raw), entry.unit)
@@ -261,7 +261,7 @@ def quantity_of(entry: Entry, raw: int, scale: Scale, units: Mapping[str, str]) 
 
 
 def axis_label(drives: Drives, description: Description, axis: int) -> str:
-    """Return the axis' name for display: node and axis there, or the axis' number alone."""
+    """Return the axis' name for display: node and axis on a bus, otherwise the axis' number."""
     if drives.bus is None:
         return f"axis {axis}"
     node, part = divmod(axis, description.num_axes)
@@ -283,7 +283,7 @@ def _of_machine(drives: Drives, axis: int) -> tuple[ShownQuantity, ...]:
 
 
 def _is_slow(entry: Entry, known: Description) -> bool:
-    """Return whether an object tells a temperature or a supply: DC link, analog inputs that the device names."""
+    """Return whether an object is a temperature or a supply: DC link, or analog inputs that the device names."""
     if entry.bits is None or entry.access == "wo":
         return False
     analog = known.dictionary.roles.get(Role.ANALOG_INPUTS)

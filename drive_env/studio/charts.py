@@ -1,7 +1,7 @@
-"""Charts of the studio: lines over a linear or logarithmic axis, drawn by the ECharts that comes with NiceGUI.
+"""Charts of the studio: lines over a linear or logarithmic axis, drawn by the ECharts library in NiceGUI.
 
-They are drawn as SVG, so that the style sheet gives texts and lines the colours of light and dark. Lines differ by
-their dashes besides their colours, which are Okabe and Ito's.
+They are drawn as SVG, so that the style sheet sets the colours of texts and lines in light and dark mode. Lines have
+different dashes in addition to colours, which are Okabe and Ito's.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from numpy.typing import ArrayLike
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8a6100", "#7f7f7f")
 DASHES: tuple[str | list[int], ...] = ("solid", [8, 4], [3, 3], [10, 3, 3, 3], [1, 3], [14, 4])
-# Lines of the axes, which are seen on white and on black.
+# Grid lines, visible on white and on black.
 SPLIT = {"show": True, "lineStyle": {"color": "#8a97a3", "opacity": 0.3}}
 AXIS = {"lineStyle": {"color": "#8a97a3"}}
-MOST_POINTS = 800  # of a line; more are not seen
+MOST_POINTS = 800  # of a line; more are not visible
 
 
 @dataclass(frozen=True)
 class ChartLine:
-    """A line: name, x and y of shape (n,), panel from above, number of its colour and of its dashes, width [pixels].
+    """A line: name, x and y of shape (n,), panel from the top, numbers of colour and dashes, width [pixels].
 
-    `fill` colours what lies between it and 0.
+    `fill` colours the area between it and 0.
     """
 
     name: str
@@ -43,7 +43,7 @@ class ChartLine:
 
 @dataclass(frozen=True)
 class ChartPanel:
-    """A panel: title and unit of its y axis, and fixed ends of it."""
+    """A panel: title with unit of its y axis, and its fixed ends, None for automatic ones."""
 
     title: str
     low: float | None = None
@@ -58,7 +58,7 @@ def options(
     logarithmic: bool = False,
     hint: str = "",
 ) -> dict[str, Any]:
-    """Return the option object of ECharts; panels share their x axis, and without lines `hint` says what makes some."""
+    """Return options of ECharts; panels share the x axis, and `hint` is shown if there are no lines."""
     count = max(1, len(panels))
     x_axis, y_axis, grid = [], [], []
     top, room = 10.0, 100.0 - 10.0 - 5.0
@@ -116,7 +116,7 @@ def _series(line: ChartLine) -> dict[str, Any]:
 
 
 def points(x: ArrayLike, y: ArrayLike) -> list[list[float | None]]:
-    """Return points of a line for JSON, thinned; non-finite values are gaps."""
+    """Return points of a line for JSON, with fewer points if necessary; non-finite values are gaps."""
     xs, ys = np.asarray(x, float), np.asarray(y, float)
     every = max(1, math.ceil(len(xs) / MOST_POINTS))
     return [
@@ -126,7 +126,7 @@ def points(x: ArrayLike, y: ArrayLike) -> list[list[float | None]]:
 
 
 def chart(label: str, name: str, height: str = "clamp(280px, 42vh, 560px)") -> ui.echart:
-    """Return an empty chart; `label` is its description for screen readers, `name` is for tests."""
+    """Return an empty chart; `label` is its description for screen readers, `name` is used in tests."""
     made = ui.echart(options([ChartPanel("")], "", []), renderer="svg")
     made.classes("studio-chart w-full").style(f"height: {height}")
     made.props(f'role="img" aria-label="{label}" data-test="{name}"')
@@ -134,7 +134,7 @@ def chart(label: str, name: str, height: str = "clamp(280px, 42vh, 560px)") -> u
 
 
 def show(made: ui.echart, wanted: dict[str, Any]) -> None:
-    """Have a chart show something else."""
+    """Replace the options of a chart."""
     made.options.clear()
     made.options.update(wanted)
     made.update()

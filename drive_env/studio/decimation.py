@@ -1,4 +1,4 @@
-"""Many samples as few columns of pixels: each keeps its least and its greatest, so that no spike is lost."""
+"""Reduces samples to columns of pixels: each column keeps its least and greatest value, so that no spike is lost."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from mechanics.arrays import Integers
 
 
 class Columns(NamedTuple):
-    """Columns of samples.
+    """Samples in columns.
 
-    starts: Place of the first sample of each column, shape (columns,).
-    low, high: Least and greatest of each column, shape (columns, ...).
+    starts: Index of the first sample of each column, shape (columns,).
+    low, high: Least and greatest value of each column, shape (columns, ...).
     """
 
     starts: Integers
@@ -23,17 +23,17 @@ class Columns(NamedTuple):
 
 
 def stride_of(count: int, columns: int) -> int:
-    """Return how many samples make a column, so that there are at most so many columns."""
+    """Return the number of samples per column with which at most `columns` columns are needed."""
     return max(1, -(-count // max(1, columns)))
 
 
 def min_max(values: NDArray[Any], stride: int, first: int = 0) -> Columns:
-    """Return samples as columns whose borders do not move while samples come: multiples of the stride.
+    """Reduce samples to columns; their borders do not move when samples are added: they are multiples of the stride.
 
     Args:
         values: Samples, shape (n, ...).
-        stride: Samples of a column.
-        first: Number of the first sample since the beginning; a column begins where its number is a multiple.
+        stride: Samples per column.
+        first: Number of the first sample since the beginning; columns begin at multiples of the stride.
     """
     count = len(values)
     if count == 0:

@@ -36,7 +36,7 @@ from drive_env.whole_file import sealed
 if TYPE_CHECKING:
     from drive_env.fieldbus.description import Description
 
-# Targets by which an axis turns without an end.
+# Targets with which an axis turns without end.
 ON_AND_ON = (
     cia402.TARGET_VELOCITY, cia402.VL_TARGET_VELOCITY, cia402.TARGET_TORQUE, cia402.VELOCITY_OFFSET,
     cia402.TORQUE_OFFSET,
@@ -44,7 +44,7 @@ ON_AND_ON = (
 
 
 class ShownValue(NamedTuple):
-    """A value for display: raw, None where it cannot be read, and as text with its unit."""
+    """A value for display: raw, None if it cannot be read, and as text with its unit."""
 
     raw: int | str | None
     text: str
@@ -59,7 +59,7 @@ class Checked:
 
 
 def values_of(entries: Sequence[Entry], axis: int, scale: Scale) -> Callable[[Drives], dict[Key, ShownValue]]:
-    """Return the job that reads objects of an axis; one that the drive refuses says so in place of its value."""
+    """Return the job that reads objects of an axis; for an object that the drive refuses the text says so."""
 
     def job(drives: Drives) -> dict[Key, ShownValue]:
         found = {}
@@ -81,7 +81,7 @@ def values_of(entries: Sequence[Entry], axis: int, scale: Scale) -> Callable[[Dr
 
 
 def shown(entry: Entry, raw: int | str, scale: Scale) -> str:
-    """Return a value as people read it."""
+    """Format a value for display."""
     if isinstance(raw, str):
         return "".join(letter if letter.isprintable() else "·" for letter in raw[:60])
     text = quantities.show(raw, entry, scale)
@@ -91,10 +91,10 @@ def shown(entry: Entry, raw: int | str, scale: Scale) -> str:
 
 
 def checked(entry: Entry, text: str, scale: Scale) -> Checked:
-    """Convert a text to an object's value, checked before anything is sent.
+    """Convert a text to an object's value, and check it before anything is sent.
 
     Raises:
-        ValueError: For a text that is not a number, or a unit that does not fit.
+        ValueError: For a text that is not a number, or has a wrong unit.
         ObjectAccessError: For an object that cannot be written, or a value out of its range.
     """
     check_writable(entry)
@@ -117,7 +117,7 @@ def write(entry: Entry, raw: int, axis: int) -> Callable[[Drives], int]:
 
 
 def store(axis: int) -> Callable[[Drives], None]:
-    """Return the job that has the drive keep its parameters (1010h:01)."""
+    """Return the job that has the drive store its parameters (1010h:01)."""
     return lambda drives: drives.write((0x1010, 1), SAVE, where=np.arange(drives.num_axes) == axis)
 
 
@@ -127,7 +127,7 @@ def snapshot(known: Description, axis: int) -> Callable[[Drives], dict[Key, int]
 
 
 def factory(known: Description) -> dict[Key, int]:
-    """Return the values that the EDS gives the parameters, where it gives any."""
+    """Return the default values of parameters in the EDS, without those that have none."""
     described: Any = _DescriptionAlone(known)
     return {
         (entry.index, entry.sub): entry.default for entry in parameters(described) if isinstance(entry.default, int)
@@ -135,19 +135,19 @@ def factory(known: Description) -> dict[Key, int]:
 
 
 class _DescriptionAlone:
-    """The part of drives that `parameters` needs: their description."""
+    """The attribute of drives that `parameters` uses: their description."""
 
     def __init__(self, description: Description) -> None:
         self.description = description
 
 
 def differences(known: Description, wanted: Mapping[Key, int], axis: int) -> Callable[[Drives], list[Difference]]:
-    """Return the job that compares an axis with values."""
+    """Return the job that compares an axis with values and returns the differences."""
     return lambda drives: compare(SingleAxes(drives, known), wanted, axis)
 
 
 def backup(known: Description, axis: int) -> Callable[[Drives], str]:
-    """Return the job that makes a backup file of an axis, as `drive-env parameters backup` does."""
+    """Return the job that creates a backup file of an axis, as `drive-env parameters backup`; it returns the text."""
 
     def job(drives: Drives) -> str:
         axes = SingleAxes(drives, known)
@@ -157,7 +157,7 @@ def backup(known: Description, axis: int) -> Callable[[Drives], str]:
 
 
 def read_file(content: bytes, name: str, known: Description) -> dict[Key, int]:
-    """Return the parameters of an uploaded file; ValueError if it has none or is damaged."""
+    """Read the parameters of an uploaded file; ValueError if it has none or is damaged."""
     with _as_file(content, name) as path:
         return load_parameters(path, known.dictionary)
 
@@ -165,15 +165,17 @@ def read_file(content: bytes, name: str, known: Description) -> dict[Key, int]:
 def restore(
     known: Description, content: bytes, name: str, axis: int, *, unchecked: bool, other_drive: bool
 ) -> Callable[[Drives], list[Difference]]:
-    """Return the job that writes a backup, all or none, as `drive-env parameters restore` does; it returns the changes.
+    """Return the job that writes a backup completely or not at all, as `drive-env parameters restore`.
+
+    The job returns the changes.
 
     Args:
-        known: The device.
-        content: The file.
-        name: Its name.
-        axis: The axis.
+        known: Description of the device.
+        content: Content of the file.
+        name: Name of the file.
+        axis: Number of the axis.
         unchecked: Accept a file that was changed since it was written.
-        other_drive: Accept one that was read from another drive.
+        other_drive: Accept a file that was read from another drive.
     """
 
     def job(drives: Drives) -> list[Difference]:
@@ -192,7 +194,7 @@ def restore(
 
 @contextmanager
 def _as_file(content: bytes, name: str) -> Iterator[Path]:
-    """Yield an uploaded content as a file of its name."""
+    """Write uploaded content to a temporary file with its name."""
     with tempfile.TemporaryDirectory(prefix="drive-env-studio-") as folder:
         path = Path(folder) / (Path(name).name or "parameters.toml")
         path.write_bytes(content)

@@ -21,15 +21,15 @@ from drive_env.studio.sentences import sentence
 from drive_env.studio.session import Session
 from drive_env.studio.visitor import Visitor
 
-ROWS = 40  # of a page of the list
-READ = 0.5  # s between two readings of what is visible
-MOST_READ = 16  # objects in one reading, so that nothing else waits for long
+ROWS = 40  # rows per page of the list
+READ = 0.5  # s between two readings of visible objects
+MOST_READ = 16  # objects in one reading, so that other jobs do not wait long
 FAVOURITES = "favourites"
 ALL = "all"
 
 
 def build(session: Session, visitor: Visitor) -> None:
-    """Make the page."""
+    """Build the page."""
     DictionaryPanel(session, visitor).build()
 
 
@@ -50,7 +50,7 @@ class DictionaryPanel:
         self._chosen: list[Entry] = self._entries
         self._first = 0
         self._visible: list[Key] = []
-        self._next = 0  # which of the visible ones is read next
+        self._next = 0  # index of the visible object that is read next
         self._rows: dict[Key, ui.label] = {}
         self._is_reading = False
 
@@ -59,7 +59,7 @@ class DictionaryPanel:
         return self._session.scales[self._axis]
 
     def build(self) -> None:
-        """Make it."""
+        """Build the page."""
         with ui.element("div").classes("studio-dictionary"):
             self._find_card()
             with ui.card().classes("studio-card studio-list"):
@@ -89,7 +89,7 @@ class DictionaryPanel:
                 )
 
     def _nodes(self) -> list[dict[str, Any]]:
-        """Return the tree: areas, then objects."""
+        """Return the nodes of the tree: areas, then objects."""
         nodes = []
         for name, (title, _) in search.AREAS.items():
             objects = {e.index: e for e in reversed(self._entries) if search.area_of(e.index) == name}
@@ -138,7 +138,7 @@ class DictionaryPanel:
         with self._list:
             for entry in shown:
                 self._row(entry)
-        self._visitor.client.run_javascript("studioDictionary.observe()")  # what was pressed may be gone by now
+        self._visitor.client.run_javascript("studioDictionary.observe()")  # the pressed button may have been removed
 
     def _turn(self, by: int) -> None:
         self._first = max(0, self._first + by)
@@ -168,7 +168,7 @@ class DictionaryPanel:
         self._next = 0
 
     def _toggle(self, key: Key) -> None:
-        """Add an object to the favourites, or take it away."""
+        """Add an object to the favourites, or remove it."""
         self._visitor.keep(lambda: self._session.workspace.toggle_favourite(key))
         if self._area.value == FAVOURITES:
             self._choose()
@@ -183,7 +183,7 @@ class DictionaryPanel:
         self._is_reading = True
         try:
             first = self._next % len(visible)
-            most = max(4, MOST_READ // max(1, self._session.num_axes))  # each is read of every axis
+            most = max(4, MOST_READ // max(1, self._session.num_axes))  # each is read for every axis
             keys = (visible + visible)[first : first + min(most, len(visible))]
             self._next = first + len(keys)
             entries = [self._known.dictionary.find(key) for key in keys]
@@ -249,7 +249,7 @@ class DictionaryPanel:
         dialog.open()
 
     def _note_motion(self, entry: Entry, raw: int) -> None:
-        """Have a target that turns an axis on and on last as long as this page is there, and awake."""
+        """Tie a target that turns an axis without end to this page: the axis stops if the page is closed or silent."""
         if cia402.of_first_axis(entry.index) not in jobs.ON_AND_ON:
             return
         presence, axes = self._session.presence, motion_jobs.masks_of(self._session.num_axes, self._axis)

@@ -1,9 +1,9 @@
-"""Who may use the studio: the host that is asked for, where a page comes from, and the token of other addresses.
+"""Access control of the studio: the requested host, the origin of a page, and the token for other addresses.
 
-A page of another site must not command drives by a visitor's browser: its requests carry its own Origin, and a name
-that it has pointed at this computer (DNS rebinding) is no host of ours. Nor may it show a page of ours in a frame,
-where a click meant for it would be one of ours. Where the studio is open to the network a token is asked for
-once, by the address that is printed, and kept in a cookie.
+A page of another site must not command drives through a visitor's browser: its requests have its own Origin, and a name
+that it has pointed at this computer (DNS rebinding) is no host of ours. Nor may it show one of our pages in a frame, in
+which a click meant for its page would act on ours. If the studio is open to the network, a token is required once, in
+the printed address, and then kept in a cookie.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ Send = Callable[[Any], Awaitable[None]]
 
 COOKIE = "drive_env_studio"
 QUERY = "token"
-TOKEN_BYTES = 16  # of chance: 22 characters
+TOKEN_BYTES = 16  # random bytes: 22 characters
 LEAST_TOKEN = 12  # characters
 LOOPBACK_NAMES = ("localhost", "127.0.0.1", "::1")
-ONCE = ("host", "origin")  # headers that two readers of a request could take for different ones if there were two
+ONCE = ("host", "origin")  # headers that, if given twice, two readers of a request could interpret differently
 FRAME_OPTIONS = b"x-frame-options"
 NO_FRAMES = [(FRAME_OPTIONS, b"DENY"), (b"content-security-policy", b"frame-ancestors 'none'")]
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether an address is reached from this computer alone."""
+    """Return whether an address can be reached from this computer only."""
     if host == "localhost":
         return True
     try:
@@ -41,12 +41,12 @@ def is_loopback(host: str) -> bool:
 
 
 def new_token() -> str:
-    """Return a token."""
+    """Return a new random token."""
     return secrets.token_urlsafe(TOKEN_BYTES)
 
 
 def checked_token(token: str) -> str:
-    """Return a token; ValueError for one that is too short, or that an address cannot carry."""
+    """Check a token and return it; ValueError if it is too short, or cannot be part of an address."""
     if len(token) < LEAST_TOKEN or not all(letter.isalnum() or letter in "-_" for letter in token):
         raise ValueError(
             f"a token of {len(token)} characters is not valid: it takes {LEAST_TOKEN} or more letters, digits, - and "
@@ -56,13 +56,13 @@ def checked_token(token: str) -> str:
 
 
 class StudioGate:
-    """Lets requests and websockets through that come from where they may.
+    """Passes requests and websockets on if their origin is allowed.
 
     Args:
-        app: What is behind.
-        host: The address that is listened on.
+        app: The application behind it.
+        host: Address on which the server listens.
         port: Its port.
-        token: What visitors must have; None on a loopback address.
+        token: Token that visitors need; None on a loopback address.
     """
 
     def __init__(self, app: Callable[[Scope, Receive, Send], Awaitable[None]], host: str, port: int,
@@ -95,7 +95,7 @@ class StudioGate:
             await _answer(send, *refusal)
 
     def refusal(self, headers: MutableMapping[str, str]) -> tuple[int, str] | None:
-        """Return why a request is refused by its Host and Origin; None for one that may come."""
+        """Return status and reason of a refusal by Host and Origin; None if the request is allowed."""
         host = headers.get("host", "").lower()
         if self._hosts is not None and host not in self._hosts:
             return (
@@ -123,7 +123,7 @@ class StudioGate:
 
 
 def _malformed(path: str, names: list[str]) -> tuple[int, str] | None:
-    """Return why a request is refused by its shape: browsers never send it, and others may read it differently."""
+    """Return status and reason of a refusal by form: browsers never send it, and other programs may misread it."""
     if twice := [name for name in ONCE if names.count(name) > 1]:
         return 400, f"The request has {names.count(twice[0])} {twice[0].capitalize()} headers; it may have one."
     if path.startswith("//") or "\\" in path or not path.isprintable():
@@ -132,7 +132,7 @@ def _malformed(path: str, names: list[str]) -> tuple[int, str] | None:
 
 
 def _place_of(origin: str) -> str:
-    """Return host and port of an origin; "" if the text is not an origin of HTTP."""
+    """Return host and port of an origin; "" if the text is not an HTTP origin."""
     try:
         found = urlsplit(origin.lower())
     except ValueError:
@@ -141,7 +141,7 @@ def _place_of(origin: str) -> str:
 
 
 def _unframed(send: Send) -> Send:
-    """Return a way to answer that lets no page show the answer in a frame, unless it says itself who may."""
+    """Wrap `send` so that no page may show the answer in a frame, unless the answer itself allows it."""
 
     async def answer(message: Any) -> None:
         if message["type"] == "http.response.start":
@@ -158,7 +158,7 @@ def _with_port(host: str, port: int) -> str:
 
 
 async def _redirect(scope: Scope, token: str, send: Send) -> None:
-    """Give the cookie, and have the token vanish from the address."""
+    """Set the cookie, and remove the token from the address."""
     query = [(k, v) for k, v in parse_qsl(scope["query_string"].decode("latin-1")) if k != QUERY]
     where = quote(scope["path"]) + (f"?{urlencode(query)}" if query else "")
     headers = [

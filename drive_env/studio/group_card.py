@@ -1,4 +1,4 @@
-"""All axes at once, on the page Axes: their table, and those of a group enabled, jogged and stopped together."""
+"""All axes on the page Axes: their table, and controls that enable, jog and stop a group of axes together."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ REFRESH = 0.2  # s
 
 
 def group_card(session: Session, visitor: Visitor) -> None:
-    """Make the card of all axes."""
+    """Build the card of all axes."""
     with card("All axes", "card-group"):
         with ui.element("div").classes("w-full studio-scroll"):
             table = ui.element("table").classes("studio-readout").props("data-test=axes")
@@ -41,7 +41,7 @@ def group_card(session: Session, visitor: Visitor) -> None:
 
 
 def _rows(session: Session, visitor: Visitor) -> list[list[ui.label]]:
-    """Make the rows of the table; return the labels of each axis."""
+    """Build the rows of the table; return the labels of each axis."""
 
     def choose(axis: int, is_in: bool) -> None:
         visitor.group = visitor.group | {axis} if is_in else visitor.group - {axis}
@@ -70,13 +70,13 @@ def _rows(session: Session, visitor: Visitor) -> list[list[ui.label]]:
 
 
 def _texts(axis: AxisState) -> tuple[str, ...]:
-    """Return the state, the mode and the motion of an axis in words."""
+    """Return state, mode and motion of an axis as texts."""
     sign = "?" if axis.state is None else LOOKS[axis.state][1]
     return f"{sign} {state_name(axis.state)}", axis.mode or "—", *(str(one) for one in axis.motion)
 
 
 def _power_row(session: Session, visitor: Visitor) -> None:
-    """Make the row that enables, disables and stops the axes of the group."""
+    """Build the row that enables, disables and stops the axes of the group."""
     shared = [name for name in MODE_NAMES if all(name in axis.modes for axis in session.axes)]
     first = "pp" if "pp" in shared else shared[0]
 

@@ -1,4 +1,4 @@
-"""A homing method as a picture: the axis with the switch that is searched, the way, and home."""
+"""Draws a homing method: the axis with the switch that is searched, the way, and the home position."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ from itertools import pairwise
 
 from drive_env.dictionary.homing_methods import PLACES, SKETCHES, TO_INDEX, HomingSketch, method_text
 
-WIDTH, LEVEL, STEP = 300.0, 34.0, 15.0  # of the picture, of the axis from above, from leg to leg
+WIDTH, LEVEL, STEP = 300.0, 34.0, 15.0  # width of the picture; distance of the axis from the top; distance between legs
 TITLES = {"left": "left limit switch", "home": "home switch", "right": "right limit switch"}
 
 
 def homing_sketch(method: int, *, is_known: bool) -> str:
-    """Return the picture of a method, "" where only the drive's manual knows it.
+    """Return the SVG of a method; "" if only the drive's manual defines it.
 
     Args:
-        method: As 6098h has it.
-        is_known: Whether the device is known: of others a negative number may mean anything.
+        method: Number in 6098h.
+        is_known: Whether the device is known: for others a negative number may have any meaning.
     """
     sketch = SKETCHES.get(method)
     if sketch is None or (method < 0 and not is_known):
@@ -34,7 +34,7 @@ def _x(place: float) -> float:
 
 
 def _axis(sketch: HomingSketch) -> list[str]:
-    """Return the axis with its ends, the switch, and the encoder's indices."""
+    """Draw the axis with its ends, the switch, and the encoder's indices."""
     ends = "".join(f"M{_x(place):g} {LEVEL - 6:g}v12" for place in (0.0, 100.0))
     parts = [f'<path class="axis" d="M0 {LEVEL:g}H{WIDTH:g}{ends}"/>']
     if sketch.switch:
@@ -51,7 +51,7 @@ def _axis(sketch: HomingSketch) -> list[str]:
 
 
 def _way(sketch: HomingSketch) -> list[str]:
-    """Return the legs of the way, one below the other, and home."""
+    """Draw the legs of the way, one below the other, and the home position."""
     parts, y = [], LEVEL + STEP
     parts.append(f'<circle class="start" cx="{_x(sketch.way[0]):g}" cy="{y:g}" r="3.5"/>')
     for k, (begin, end) in enumerate(pairwise(sketch.way)):

@@ -14,8 +14,8 @@ from drive_env.studio.session import Session
 from drive_env.studio.visitor import Visitor
 
 SCRIPTS = ("studio", "scope", "dictionary")
-REFRESH = 0.2  # s between two looks at the session
-# Of a state: the class of its colour and a sign, for who sees no colours.
+REFRESH = 0.2  # s between two readings of the session
+# For each state: CSS class, and a sign that needs no colour.
 LOOKS = {
     State.NOT_READY_TO_SWITCH_ON: ("is-off", "○"),
     State.SWITCH_ON_DISABLED: ("is-off", "○"),
@@ -26,19 +26,19 @@ LOOKS = {
     State.FAULT_REACTION_ACTIVE: ("is-fault", "▲"),
     State.FAULT: ("is-fault", "▲"),
 }
-COLOURS = {  # Okabe and Ito's, which colour-blind people tell apart
+COLOURS = {  # Okabe and Ito's, which colour-blind users can distinguish
     "primary": "#0072B2", "secondary": "#56B4E9", "accent": "#CC79A7", "positive": "#009E73", "negative": "#C2410C",
     "warning": "#E69F00", "info": "#0072B2",
 }  # fmt: skip
 
 
 def state_name(state: State | None) -> str:
-    """Return a state as the standard writes it."""
+    """Return a state's name as in the standard."""
     return "unknown" if state is None else state.name.replace("_", " ").capitalize()
 
 
 def frame(session: Session, visitor: Visitor, pages: Sequence[StudioPage], page: StudioPage) -> None:
-    """Make a page: its frame, and its content once the drives are open."""
+    """Build a page: its frame, and its content once the drives are open."""
     ui.colors(**COLOURS)
     scripts = "".join(f'<script src="/studio/assets/{name}.js"></script>' for name in SCRIPTS)
     ui.add_head_html(f'<link rel="stylesheet" href="/studio/assets/studio.css">{scripts}')
@@ -60,7 +60,7 @@ def _content(session: Session, visitor: Visitor, page: StudioPage) -> None:
 
 
 def _await_drives(session: Session) -> None:
-    """Say that the drives are being opened, or why they are not; then load the page again."""
+    """Show that the drives are being opened, or why that failed; then reload the page."""
     with ui.column().classes("w-full items-center studio-wait"):
         spinner = ui.spinner(size="lg")
         told = ui.label("Opening the drives. On a new computer the emulator is compiled first, which takes a minute.")
@@ -130,7 +130,7 @@ def _show_state(state: AxisState | None, chip: ui.element, sign: ui.label, text:
 
 
 def _axis_choice(session: Session, visitor: Visitor, page: StudioPage) -> None:
-    """Let people choose an axis, where there are several."""
+    """Build the choice of the axis, if there are several."""
     if session.num_axes < 2:
         return
     names = {axis.axis: axis.name for axis in session.axes}
@@ -159,14 +159,14 @@ def _job_chip(session: Session) -> None:
 
 
 def _stop_button() -> None:
-    with ui.footer().classes("studio-footer"):  # it has its own place, so that it covers nothing
+    with ui.footer().classes("studio-footer"):  # it has its own area, so that it covers nothing
         button = ui.button("Quick stop", icon="dangerous", color=None).classes("studio-stop")
         button.props('unelevated no-caps aria-keyshortcuts="Space" aria-label="Quick stop (space bar)"')
         button.on("click", js_handler="() => studio.stop()")
 
 
 def _tell_events(session: Session, visitor: Visitor) -> None:
-    """Show events on this page from now on."""
+    """Show new events on this page."""
     seen = session.num_events
 
     def look() -> None:

@@ -1,7 +1,7 @@
-"""The picture of the emulated machine as it moves: drawn in a thread of its own, only while a page shows it.
+"""The moving picture of the emulated machine: drawn in its own thread, and only while a page shows it.
 
-Without a graphics card a picture costs some milliseconds of a core; the time between two of them follows what they
-cost, so that drawing takes a set share of a core at most. A machine that stands still costs nothing.
+Without a graphics card a picture takes some milliseconds of CPU time; the interval between pictures is adapted, so that
+drawing takes at most a set share of a core. A machine at rest is not drawn again.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from drive_env.studio.session import Session
 
 
-PERIOD = 0.1  # s between two pictures, at least
-SHARE = 0.15  # of a core that drawing may take
+PERIOD = 0.1  # s, least interval between two pictures
+SHARE = 0.15  # greatest share of a core for drawing
 WIDTH, HEIGHT = 640, 480  # pixels
 QUALITY = 80  # of the JPEG
-STILL = 1e-4  # rad or m: less is no motion that can be seen
+STILL = 1e-4  # rad or m: a smaller motion is invisible
 
 
 class MachineCamera:
@@ -47,14 +47,14 @@ class MachineCamera:
         self._next = 0.0
         self.period = PERIOD
         self.cost = 0.0
-        # OpenGL belongs to the thread in which it was opened.
+        # OpenGL can only be used in the thread that opened it.
         self.thread = ThreadPoolExecutor(1, thread_name_prefix="studio camera")
 
     def picture(self, seen: int) -> tuple[int, bytes]:
-        """Return the newest picture as a JPEG with its number; it is empty if that was seen. In the camera's thread.
+        """Return number and JPEG of the newest picture, b"" if it is number `seen`; call it in the camera's thread.
 
         Raises:
-            RuntimeError: If nothing can be drawn, with the reason and the remedy.
+            RuntimeError: If drawing is impossible; the message has the reason and the remedy.
         """
         if self._failure is not None:
             raise self._failure
@@ -67,7 +67,7 @@ class MachineCamera:
         return self._number, b"" if self._number == seen else self._picture
 
     def close(self) -> None:
-        """Give OpenGL back."""
+        """Close OpenGL."""
         self.thread.submit(self._close)
         self.thread.shutdown(wait=False)
 

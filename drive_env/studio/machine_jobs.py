@@ -1,4 +1,4 @@
-"""The jobs of the page Machine on emulated machines: parameters, torque, supply, faults."""
+"""The jobs of the page Machine for emulated machines: parameters, torque, supply, faults."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ if TYPE_CHECKING:
 
 
 def set_parameters(values: Mapping[str, float]) -> Callable[[Drives], None]:
-    """Return the job that gives the machine several parameters at once."""
+    """Return the job that sets several parameters of the machine at once."""
     return lambda drives: machine_of(drives).set_all(values)
 
 
 def act(quantity: str, value: float) -> Callable[[Drives], None]:
-    """Return the job that sets "load_torque" [N*m, or N of a load that moves in a line] or "supply" [V]."""
+    """Return the job that sets "load_torque" [N*m, or N for a linear load] or "supply" [V]."""
     return lambda drives: setattr(machine_of(drives), quantity, value)
 
 
 def begin_fault(name: str, duration: float | None, when: str, given: Mapping[str, Any]) -> Callable[[Drives], int]:
-    """Return the job that lets something fail, and returns the fault's number."""
+    """Return the job that begins a fault and returns its number."""
     numbers: Any = dict(given)
     return lambda drives: _machines(drives).fault(name, duration=duration, when=when, **numbers)
 
 
 def end_faults(name: str | None) -> Callable[[Drives], None]:
-    """Return the job that ends the faults of a name, None all of them; those that are over already are no error."""
+    """Return the job that ends the faults with a name, None for all; faults that have already ended are no error."""
 
     def job(drives: Drives) -> None:
         machines = _machines(drives)
@@ -41,7 +41,7 @@ def end_faults(name: str | None) -> Callable[[Drives], None]:
 
 
 def take_step(step: str, name: str, axis: int) -> Callable[[Drives], None]:
-    """Return the job that takes a step of the way back from a fault (`STEPS`), of an axis where it is of one."""
+    """Return the job for a step that ends a fault's effects (`STEPS`), for one axis if the step needs one."""
     if step == "end":
         return end_faults(name)
     if step == "reset_fault":

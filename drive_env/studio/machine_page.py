@@ -1,4 +1,4 @@
-"""The page Machine: the emulated load as it moves, its parameters, loads, supply and faults."""
+"""The page Machine: the moving emulated load, its parameters, external loads, supply and faults."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _cameras: weakref.WeakKeyDictionary[Session, MachineCamera] = weakref.WeakKeyDic
 
 
 class KnownMachine(NamedTuple):
-    """Properties of the machine read once: rows of parameters, meanings, possible faults, torque's unit and range."""
+    """Constant properties of the machine: rows of parameters, meanings, possible faults, torque's unit and range."""
 
     rows: dict[str, Any]
     meanings: dict[str, str]
@@ -45,7 +45,7 @@ class KnownMachine(NamedTuple):
 
 
 def attach(web: FastAPI, session: Session) -> None:
-    """Add the way by which pictures come to the page."""
+    """Add the websocket for pictures to the web application."""
 
     @web.websocket("/studio/machine")
     async def pictures(line: WebSocket) -> None:
@@ -94,7 +94,7 @@ def know(machine: Machines) -> KnownMachine:
 
 
 def build(session: Session, visitor: Visitor) -> None:
-    """Make the page."""
+    """Build the page."""
     ui.add_head_html('<link rel="stylesheet" href="/studio/assets/pages.css">')
     known = session.glimpse(know, 10.0)
     if known is None:
@@ -114,7 +114,7 @@ class MachinePanel:
     Args:
         session: The drives.
         visitor: The page.
-        known: What the machine is.
+        known: Properties of the machine.
     """
 
     def __init__(self, session: Session, visitor: Visitor, known: KnownMachine) -> None:
@@ -126,7 +126,7 @@ class MachinePanel:
         self._is_setting = False
 
     def build(self) -> None:
-        """Make it."""
+        """Build the page."""
         ui.add_head_html('<script src="/studio/assets/machine.js"></script>')
         with ui.element("div").classes("studio-machine"):
             with ui.element("div").classes("studio-stack"):
@@ -157,7 +157,7 @@ class MachinePanel:
 
         ui.timer(REFRESH, show)
 
-    # --- what acts on it ------------------------------------------------------------------------------------------
+    # --- external quantities --------------------------------------------------------------------------------------
     def _world_card(self) -> None:
         known = self._known
         with self._card("What acts on it", "world"):
@@ -176,7 +176,7 @@ class MachinePanel:
         self, title: str, unit: str, value: float, ends: tuple[float, float], name: str,
         act: Callable[[float], Any], meaning: str = "",
     ) -> tuple[ui.slider, ui.number]:  # fmt: skip
-        """Make a slider and a number, each of which acts once it is let go."""
+        """Build a slider and a number, each of which acts when it is released."""
         low, high = min(ends[0], value), max(ends[1], value)
         step = (high - low) / STOPS or 1.0
         with ui.element("div").classes("studio-param"):
@@ -350,7 +350,7 @@ class MachinePanel:
         return box
 
     def _reaction(self, row: FaultRow) -> None:
-        """Make what the drive should show of a fault beside what it shows, and the steps of the way back."""
+        """Show the expected reaction to a fault beside the real one, and the steps that end its effects."""
         device = self._session.description.device
         known = None if device is None else row.on_firmware(device.firmware_name)
         with ui.column().classes("w-full gap-2").props(f"data-test=reaction-{row.name}") as reaction:
@@ -378,14 +378,14 @@ class MachinePanel:
 
 
 def _expected(row: FaultRow | None) -> str:
-    """Return in words what a drive tells of a fault; None where the table does not know the drive."""
+    """Describe the emergency that a drive should send for a fault; None means that the table has no reaction."""
     if row is None:
         return "not known of this drive, what follows is its emulator's word alone"
     return "no emergency: this drive does not see it" if row.emergency is None else f"emergency {row.emergency:04X}h"
 
 
 def _shown(state: AxisState | None) -> str:
-    """Return the emergencies of an axis since its last reset, and its state, in words; "" for no axis."""
+    """Describe the emergencies of an axis since its last reset, and its state; "" without an axis."""
     if state is None:
         return ""
     codes = ", ".join(f"{fault.code:04X}h {fault.text.name}" for fault in state.faults) or "no emergency"

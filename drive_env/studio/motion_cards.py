@@ -1,4 +1,4 @@
-"""What moves the axis of a page, on the pages Axes and Scope: enable, jog, move, home, test signals."""
+"""Cards that move the axis of a page, on the pages Axes and Scope: enable, jog, move, home, test signals."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ REFRESH = 0.2  # s
 
 
 def card(title: str, name: str) -> ui.card:
-    """Return a card with a heading; `name` is its class."""
+    """Return a card with a heading; `name` is its CSS class."""
     made = ui.card().classes(f"studio-card {name}")
     with made:
         ui.label(title).classes("studio-heading").props('role="heading" aria-level="2"')
@@ -25,7 +25,7 @@ def card(title: str, name: str) -> ui.card:
 
 
 def power_row(visitor: Visitor) -> None:
-    """Make the row that chooses the mode, enables and disables the axis of a page."""
+    """Build the row that chooses the mode, and enables and disables the axis of a page."""
     with ui.row().classes("studio-buttons"):
         modes = {name: f"{name}  {MODE_NAMES[name]}" for name in _modes(visitor.state)}
         first = _first_mode(visitor.state)
@@ -42,7 +42,7 @@ def power_row(visitor: Visitor) -> None:
             await visitor.do(motion_jobs.select_mode(visitor.axis, str(mode.value)), f"Mode {mode.value}")
 
         def follow() -> None:
-            """Have the choice show a mode that the axis has changed to, by this page or by another one."""
+            """Update the choice when the axis has changed its mode, by this page or another one."""
             nonlocal first
             state = visitor.state
             if state is not None and state.mode != first and state.mode in modes:
@@ -62,7 +62,7 @@ def _modes(state: AxisState | None) -> tuple[str, ...]:
 
 
 def _first_mode(state: AxisState | None) -> str:
-    """Return the mode that the axis is in, else the first that moves to places."""
+    """Return the mode of the axis if known, else pp, or the first mode without it."""
     modes = _modes(state)
     if state is not None and state.mode in modes:
         return state.mode
@@ -70,7 +70,7 @@ def _first_mode(state: AxisState | None) -> str:
 
 
 def move_rows(session: Session, visitor: Visitor) -> None:
-    """Make the rows that jog, move and home the axis of a page."""
+    """Build the rows that jog, move and home the axis of a page."""
     ui.label("Jog: as long as you hold").classes("studio-label")
     with ui.row().classes("studio-buttons"):
         speed = ui.input("Jog speed", value=visitor.jog_speed, placeholder="60 rpm").props("dense outlined")
@@ -104,7 +104,7 @@ def move_rows(session: Session, visitor: Visitor) -> None:
 
 
 def home_rows(session: Session, visitor: Visitor) -> None:
-    """Make the rows that home the axis of a page, by its own method or by one of those that it has."""
+    """Build the rows that home the axis of a page, by the method in 6098h or another one of the drive."""
     known = session.description
     with ui.row().classes("studio-buttons"):
         method = ui.select({0: "reading"}, value=0, label="Homing method").props("dense outlined").classes("grow")
@@ -139,7 +139,7 @@ def home_rows(session: Session, visitor: Visitor) -> None:
 
 
 def signal_rows(session: Session, visitor: Visitor) -> None:
-    """Make the rows that play a test signal on the axis of a page."""
+    """Build the rows that play a test signal on the axis of a page."""
     titles = signals_of(_modes(visitor.state), session.description.has, session.plays)
     if not titles:
         ui.label("This drive has no mode in which set-points are played (csp, csv, cst).").classes("studio-hint")

@@ -1,4 +1,4 @@
-"""The jobs of the page Axes, each a function of the drives."""
+"""The jobs of the page Axes, which run in the drives' thread."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ LONGEST_MOVE = 600.0  # s
 
 
 def masks_of(num_axes: int, axes: AxisNumbers) -> Mask:
-    """Return the mask of an axis, or of some, of so many."""
+    """Return the mask of one or several axes among `num_axes`."""
     return np.isin(np.arange(num_axes), axes)
 
 
 def turned_round(speed: str, direction: int) -> str:
-    """Return a speed as text, forwards for +1, backwards for -1."""
+    """Return a speed as text, with its sign reversed for direction -1."""
     text = speed.strip()
     if direction >= 0:
         return text
@@ -44,7 +44,7 @@ def turned_round(speed: str, direction: int) -> str:
 
 
 def only(drives: Drives, axes: AxisNumbers) -> Mask:
-    """Return the mask of an axis, or of some."""
+    """Return the mask of one or several axes of the drives."""
     return masks_of(drives.num_axes, axes)
 
 
@@ -81,7 +81,7 @@ def start_node(axis: int) -> MotionJob:
 
 
 def command(axis: int, word: int) -> MotionJob:
-    """Return the job that writes a controlword of the state machine; one that enables moves to no target of before."""
+    """Return the job that writes a controlword of the state machine; enabling does not move to an old target."""
 
     def job(drives: Drives) -> None:
         if word == cia402.FAULT_RESET:
@@ -96,12 +96,12 @@ def command(axis: int, word: int) -> MotionJob:
 
 
 def select_mode(axis: int, mode: str) -> MotionJob:
-    """Return the job that selects a mode of operation; an axis that is enabled stays where it is."""
+    """Return the job that selects a mode of operation; an enabled axis does not move."""
     return lambda drives: motion.select_mode(drives, mode, where=only(drives, axis))
 
 
 def home(axis: int, method: int) -> MotionJob:
-    """Return the job that homes an axis by a method, which 6098h has meanwhile; by that of 6098h for 0."""
+    """Return the job that homes an axis; a method is in 6098h during it, 0 means the one that 6098h has."""
 
     def job(drives: Drives) -> None:
         where, own = only(drives, axis), int(drives.read(cia402.HOMING_METHOD)[axis])
@@ -112,9 +112,9 @@ def home(axis: int, method: int) -> MotionJob:
 
 
 def homing_methods(known: Description, axis: int) -> Callable[[Drives], tuple[int, dict[int, str]]]:
-    """Return the job that reads 6098h, and the methods that an axis has, each with what it does.
+    """Return the job that reads 6098h, and the homing methods of an axis, each with its description.
 
-    Of a drive that does not list its own these are those of CiA 402.
+    For a drive that does not list its methods these are those of CiA 402.
     """
 
     def job(drives: Drives) -> tuple[int, dict[int, str]]:
@@ -131,11 +131,11 @@ def move(session: Session, axis: int, goal: str, speed: str, *, relative: bool) 
     """Return the job that moves an axis in pp.
 
     Args:
-        session: Knows the units.
-        axis: The axis.
-        goal: Where to, or how far: "1 rev", "90 deg", or an integer of the drive's unit.
-        speed: Profile velocity; "" leaves the drive's.
-        relative: Whether the goal is from where the axis is.
+        session: Provides the units.
+        axis: Number of the axis.
+        goal: Position or distance: "1 rev", "90 deg", or an integer in the drive's unit.
+        speed: Profile velocity; "" keeps the drive's.
+        relative: Whether the goal is a distance from the present position.
     """
 
     def job(drives: Drives) -> None:
@@ -153,15 +153,15 @@ def move(session: Session, axis: int, goal: str, speed: str, *, relative: bool) 
 
 
 def turn(session: Session, axes: AxisNumbers, speed: str, number: int) -> MotionJob:
-    """Return the job that turns axes in pv, or in vl of drives without it, as long as a motion of a page lasts.
+    """Return the job that turns axes in pv, or vl for drives without it, as long as a page's motion lasts.
 
-    Several begin together, and none does where one is not enabled; from then on all are stopped where one is lost.
+    Several axes begin together, or none if one is not enabled; later all are stopped if one is lost.
 
     Args:
-        session: Knows the units, and the motion.
-        axes: The axis, or some.
-        speed: Signed.
-        number: Of the motion.
+        session: Provides units and motions.
+        axes: One or several axes.
+        speed: Signed speed as text.
+        number: Number of the motion.
     """
 
     def job(drives: Drives) -> None:
@@ -185,7 +185,7 @@ def turn(session: Session, axes: AxisNumbers, speed: str, number: int) -> Motion
 
 
 def end_turn(axes: AxisNumbers) -> MotionJob:
-    """Return the job that lets axes come to rest by their own ramps: a button was released."""
+    """Return the job that stops axes by their own ramps, after a button was released."""
 
     def job(drives: Drives) -> None:
         if (on := _enabled(drives, only(drives, axes))).any():
@@ -195,7 +195,7 @@ def end_turn(axes: AxisNumbers) -> MotionJob:
 
 
 def parsed(session: Session, axis: int, text: str, name: ObjectName) -> int:
-    """Parse a text as an object's integer of an axis; ValueError for a text that is not one, or beyond its range."""
+    """Parse a text as an object's integer of an axis; ValueError for an invalid text, or a value out of range."""
     known: Description = session.description
     entry = known.dictionary.find(name)
     raw = quantities.parse(text, entry, session.scales[axis])
@@ -204,28 +204,28 @@ def parsed(session: Session, axis: int, text: str, name: ObjectName) -> int:
 
 
 def check_enabled(drives: Drives, axis: int) -> None:
-    """Raise RuntimeError for an axis that is not in operation enabled."""
+    """Raise RuntimeError for an axis that is not in "operation enabled"."""
     status = int(drives.read(cia402.STATUSWORD)[axis])
     if not cia402.matches(status, cia402.OPERATION_ENABLED):
         raise RuntimeError(f"axis {axis} is not enabled and cannot move: statusword {status:04X}h; enable it first")
 
 
 def mode_of(drives: Drives, axis: int) -> str:
-    """Return the mode of operation of an axis by its abbreviation, "" for none."""
+    """Return the abbreviation of an axis' mode of operation; "" without one."""
     try:
         number = int(drives.read(cia402.MODE_DISPLAY)[axis])
-    except ObjectAccessError:  # a drive that does not show it
+    except ObjectAccessError:  # a drive without 6061h
         number = int(drives.read(cia402.MODE)[axis])
     return next((name for name, one in cia402.MODES.items() if one == number), "")
 
 
 def _enabled(drives: Drives, where: Mask) -> Mask:
-    """Return those of some axes that are in operation enabled."""
+    """Return which of some axes are in "operation enabled"."""
     return np.asarray(where & cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED))
 
 
 def _await_rest(drives: Drives, where: Mask, timeout: float = 5.0) -> None:
-    """Let time pass until the quick stop of axes is over, or they have left its state."""
+    """Let time pass until the quick stop of axes is complete, or they have left its state."""
     waited = 0.0
     while waited < timeout and motion.is_turning(drives, where, 0.02):
         waited += 0.02

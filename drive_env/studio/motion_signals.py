@@ -1,7 +1,7 @@
-"""Test signals of an axis, as rows: steps, square waves, sweeps, torque pulses; and the job that plays one.
+"""Test signals of an axis as rows of set-points: steps, square waves, sweeps, torque pulses; and their job.
 
-A signal that would leave the limits of its axis is refused before anything moves. What a current does with an axis is
-not known before: its way and its speed are watched while it acts, by the envelope on a bus, by this module elsewhere.
+A signal that would leave the limits of its axis is refused before anything moves. The effect of a current cannot be
+computed before: position and speed are monitored while it acts, on a bus by the envelope, otherwise by this module.
 """
 
 from __future__ import annotations
@@ -31,23 +31,23 @@ if TYPE_CHECKING:
     from drive_env.dictionary.entries import ObjectName
     from drive_env.studio.session import Session
 
-QUIET, AFTER = 0.05, 0.2  # s at rest before a signal, and after one that does not leave the axis turning
+QUIET, AFTER = 0.05, 0.2  # s at rest before a signal, and after one that leaves the axis at rest
 LONGEST = 10.0  # s
-MOST_PUSH = 1.0  # s for which a current may push one way: a free axis gains speed as long as it does
-LOOK = 0.005  # s of emulated time between two looks whether the axis is within its limits
-BRAKING = 5.0  # s that an axis gets to come to rest after a current
-FEWEST = 4  # samples of the highest frequency's period
-FADED = 0.1  # share of a sweep in which it comes and goes
-RESTS, REST_LOOK = 0.004, 0.05  # rev that an axis at rest may move in so many s: some counts of a coarse encoder
+MOST_PUSH = 1.0  # s, longest current in one direction: a free axis accelerates during all of it
+LOOK = 0.005  # s of emulated time between two checks of the limits
+BRAKING = 5.0  # s, longest wait for rest after a current
+FEWEST = 4  # samples per period of the highest frequency
+FADED = 0.1  # share of a sweep over which it fades in and out
+RESTS, REST_LOOK = 0.004, 0.05  # rev that an axis at rest may move in this time [s]: some counts of a coarse encoder
 SWITCHED_OFF = 2**31  # a following error window that switches its monitoring off
-# s of a torque pulse, and the share of it that 6077h must show there: loops that hold the axis take it back later.
+# s of a torque pulse, in which 6077h must show at least this share: later, loops that hold the axis compensate for it.
 ONSET, FOLLOWED_SHARE = 0.01, 0.2
 POSITION, VELOCITY, CURRENT = cia402.POSITION_ACTUAL, cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL
 CURRENTS = (cia402.TARGET_TORQUE, cia402.TORQUE_OFFSET)
 
 
 class MotionSignal(NamedTuple):
-    """A test signal: its title, the mode, the object that is played, its shape, and a height to begin with."""
+    """A test signal: its title, the mode, the played object, its shape, and a default height."""
 
     title: str
     mode: str
@@ -69,7 +69,7 @@ SIGNALS = {
     "load_step": MotionSignal("Load step: torque pulse while it holds its position (csp, 60B2h)", "csp",
                               cia402.TORQUE_OFFSET, "step", "0.5 A"),
 }  # fmt: skip
-# Of each shape the parameters that count: title, unit.
+# For each shape the parameters that it uses: title, unit.
 SHAPES = {
     "step": {"held": "Held [s]"},
     "square": {"held": "Half a period [s]", "cycles": "Periods"},
@@ -79,15 +79,15 @@ SHAPES = {
 
 @dataclass(frozen=True)
 class SignalSettings:
-    """What is asked for: a row of `SIGNALS`, and its parameters.
+    """The settings of a test signal: a row of `SIGNALS`, and its parameters.
 
     Attributes:
-        name: Of the row.
-        height: Or amplitude, with its unit.
-        travel: How far the axis may go from where it stands, with its unit.
-        speed: Its highest speed, with its unit; "" for the drive's own limit.
-        held: Time at the height [s]; of a square wave half a period.
-        cycles: Periods of a square wave.
+        name: Name of the row.
+        height: Height or amplitude, with its unit.
+        travel: Greatest distance from the present position, with its unit.
+        speed: Greatest speed, with its unit; "" selects the drive's own limit.
+        held: Duration of the height [s]; for a square wave half a period.
+        cycles: Number of periods of a square wave.
         low, high: First and last frequency of a sweep [Hz].
         lasts: Duration of a sweep [s].
     """
@@ -104,7 +104,7 @@ class SignalSettings:
 
 
 class AxisRoom(NamedTuple):
-    """Where an axis stands and may go [rev], its highest speed [rev/s], its quick stop [rev/s^2], inf if unknown."""
+    """Present position and range of an axis [rev], its greatest speed [rev/s], quick stop [rev/s^2], inf if unknown."""
 
     here: float
     low: float
@@ -113,7 +113,7 @@ class AxisRoom(NamedTuple):
     braking: float
 
     def why_left(self, position: Floats, velocity: Floats) -> str:
-        """Return why samples of position [rev] and velocity [rev/s] are not within it; "" if a stop ends in it, too."""
+        """Return why samples of position [rev] and velocity [rev/s] leave the range; "" if even a stop ends inside."""
         end = position + np.sign(velocity) * velocity**2 / (2.0 * self.braking)
         if (fast := float(np.abs(velocity).max())) > self.speed:
             return f"it turned at {60.0 * fast:.4g} rpm, and {60.0 * self.speed:.4g} rpm are allowed"
@@ -124,19 +124,19 @@ class AxisRoom(NamedTuple):
 
     @property
     def told(self) -> str:
-        """How far the axis may go, in words."""
+        """The range of the axis as text."""
         return f"{self.low - self.here:.3g} to {self.high - self.here:.3g} rev"
 
 
 def signals_of(
     modes: tuple[str, ...], has: Callable[[Key], bool], plays: Callable[[Key], bool] = lambda key: True
 ) -> dict[str, str]:
-    """Return the titles of the signals that an axis can play; {} if it tells no position.
+    """Return the titles of the signals that an axis can play; {} if its drive has no actual position or velocity.
 
     Args:
-        modes: Of its drive.
+        modes: Modes of its drive.
         has: Whether the drive has an object.
-        plays: Whether it takes one with every cycle.
+        plays: Whether the drive accepts an object in every cycle.
     """
     if not (has((POSITION, 0)) and has((VELOCITY, 0))):
         return {}
@@ -145,13 +145,13 @@ def signals_of(
 
 
 def course(settings: SignalSettings, cycle: float) -> Floats:
-    """Return a signal over its height at each cycle [s], in -1...1, 0 at both ends; shape (n,).
+    """Return a signal over its height for each cycle [s], in -1...1, 0 at both ends; shape (n,).
 
-    A square wave begins and ends with half of `held`, and a sweep of speed or current with its crest, so that a speed,
-    or the one that a current causes, brings the axis back to where it was.
+    A square wave begins and ends with half of `held`, and a sweep of speed or current with its crest, so that the axis
+    returns to its first position.
 
     Raises:
-        ValueError: For a duration or frequencies that cannot be.
+        ValueError: For an impossible duration or impossible frequencies.
     """
     row = SIGNALS[settings.name]
     is_current = row.target in CURRENTS
@@ -194,13 +194,14 @@ def _check_duration(duration: float) -> None:
 
 
 def play_signal(session: Session, axis: int, settings: SignalSettings) -> Callable[[Drives], str]:
-    """Return the job that plays a signal on an axis that is enabled, which is in its mode of before afterwards.
+    """Return the job that plays a signal on an enabled axis, and restores its mode.
 
-    It returns a message to show; "" for none.
+    The job returns a message to show; "" for none.
 
     Raises:
-        ValueError: In the job, for a signal that would leave the limits of the axis; nothing moves then.
-        RuntimeError: In the job, for an axis that is not enabled or turns; or that left its limits: it is stopped.
+        ValueError: Raised by the job for a signal that would leave the limits of the axis; nothing moves then.
+        RuntimeError: Raised by the job for an axis that is not enabled or turns; or that left its limits and is
+            stopped.
     """
 
     def job(drives: Drives) -> str:
@@ -224,7 +225,7 @@ def play_signal(session: Session, axis: int, settings: SignalSettings) -> Callab
 
 
 def size_of(session: Session, axis: int, name: ObjectName) -> float:
-    """Return the size of a count of an object [rev, rev/s, rev/s^2, A]; ValueError where its unit is not known."""
+    """Return the size of a count of an object [rev, rev/s, rev/s^2, A]; ValueError if its unit is unknown."""
     entry = session.description.dictionary.find(name)
     unit = find_unit(entry.unit, session.scales[axis])
     if unit is None:
@@ -233,7 +234,7 @@ def size_of(session: Session, axis: int, name: ObjectName) -> float:
 
 
 def _room(drives: Drives, session: Session, axis: int, settings: SignalSettings) -> AxisRoom:
-    """Return where an axis may go and how fast: what was asked for, within what its drive allows."""
+    """Return the allowed range and speed of an axis: those of the settings, within its drive's limits."""
     known, count = session.description, size_of(session, axis, POSITION)
     travel = count * parsed(session, axis, settings.travel, cia402.TARGET_POSITION)
     if travel <= 0.0:
@@ -264,7 +265,7 @@ def _room(drives: Drives, session: Session, axis: int, settings: SignalSettings)
 def _check_limits(
     drives: Drives, session: Session, axis: int, row: MotionSignal, asked: tuple[int, int, Floats], room: AxisRoom
 ) -> None:
-    """Raise ValueError for a signal that leaves the limits of an axis; `asked` is its peak, height [counts], course."""
+    """Raise ValueError for a signal that leaves the axis' limits; `asked`: its peak and height [counts], and course."""
     peak, height, wave = asked
     size, cycle = size_of(session, axis, row.target), session.description.cycle
     if row.target in CURRENTS:
@@ -294,7 +295,7 @@ def _check_limits(
 
 
 def _check_jump(drives: Drives, session: Session, axis: int, row: MotionSignal, height: int) -> None:
-    """Raise ValueError for a jump of position that a drive answers with a fault, or a stepper with lost steps."""
+    """Raise ValueError for a position jump that would cause a fault, or lost steps of a stepper."""
     if row.target != cia402.TARGET_POSITION or row.shape == "sweep":
         return
     if session.description.role(Role.MICROSTEPS) is not None:
@@ -313,7 +314,7 @@ def _check_jump(drives: Drives, session: Session, axis: int, row: MotionSignal, 
 
 @contextmanager
 def _held_to(drives: Drives, session: Session, axis: int, room: AxisRoom) -> Iterator[None]:
-    """Have the envelope of a bus hold an axis to its room meanwhile; currents that swing are meant to."""
+    """Limit a bus' envelope to the axis' range during the block; it allows oscillating currents, which are intended."""
     envelope = drives.safety
     if envelope is None:
         yield
@@ -335,14 +336,14 @@ def _held_to(drives: Drives, session: Session, axis: int, room: AxisRoom) -> Ite
 
 @contextmanager
 def _in_mode(drives: Drives, session: Session, axis: int, mode: str, room: AxisRoom) -> Iterator[None]:
-    """Have an enabled axis at rest in a mode; afterwards it is at rest and in its mode of before.
+    """Bring an enabled axis at rest to a mode; restore its mode, at rest, at the end.
 
-    What raises leaves the axis to the session, which stops it.
+    After an error the session stops the axis.
     """
     where, before = only(drives, axis), mode_of(drives, axis)
     motion.select_mode(drives, mode, where=where)
     yield
-    if mode == "cst":  # it turns: no mode of positions takes it over like that
+    if mode == "cst":  # it turns: position modes must not take over a turning axis
         motion.select_mode(drives, motion.turning_mode(drives), where=where)
         waited = 0.0
         while _turns(drives, session, axis, room):
@@ -353,7 +354,7 @@ def _in_mode(drives: Drives, session: Session, axis: int, mode: str, room: AxisR
 
 
 def _turns(drives: Drives, session: Session, axis: int, room: AxisRoom | None = None) -> bool:
-    """Let a while pass and return whether an axis moved; RuntimeError if it left its room, None for any."""
+    """Let some time pass and return whether an axis moved; RuntimeError if it left its range, which None disables."""
     before = int(drives.read(POSITION)[axis])
     if room is None:
         drives.advance(REST_LOOK)
@@ -363,13 +364,13 @@ def _turns(drives: Drives, session: Session, axis: int, room: AxisRoom | None = 
 
 
 def _play(drives: Drives, session: Session, axis: int, row: MotionSignal, rows: np.ndarray, room: AxisRoom) -> str:
-    """Play the rows of a signal on top of its object's value; return the message to show, "" for none."""
+    """Play the rows of a signal, added to its object's value; return the message to show, "" for none."""
     cycle, where = session.description.cycle, only(drives, axis)
     now = drives.read(row.target)
     played = now + rows[:, None] * where
-    # A drive that adds the offset may do so only as long as set-points come.
+    # A drive may add the offset only while set-points arrive.
     place = drives.read(cia402.TARGET_POSITION) if row.target == cia402.TORQUE_OFFSET else None
-    piece = round(LOOK / cycle) if drives.time_waits else len(rows)  # on a bus the envelope looks, and no gap is wanted
+    piece = round(LOOK / cycle) if drives.time_waits else len(rows)  # on a bus the envelope monitors it, without gaps
     current = []
     for first in range(0, len(rows), piece):
         part = played[first : first + piece]
@@ -396,7 +397,7 @@ def _watched(
     """Let time pass [s] while rows are played, and return the current of each cycle [A], shape (n,).
 
     Raises:
-        RuntimeError: If the axis was not within its room; the session stops it.
+        RuntimeError: If the axis left its range; the session stops it.
     """
     names = [name for name in (POSITION, VELOCITY, CURRENT) if session.description.has((name, 0))]
     trace = drives.record(names, duration, play=play, period=session.description.cycle)

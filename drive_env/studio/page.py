@@ -1,4 +1,4 @@
-"""A page of the studio, as a row: its address, its title, and the function that makes it."""
+"""The definition of a studio page: its address, its title, and the function that builds it."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ class StudioPage:
     """A page.
 
     Attributes:
-        path: Where it is: "/scope".
+        path: Its address, e.g. "/scope".
         title: Its name in the navigation.
-        icon: The name of a Material icon.
-        order: Its place in the navigation, from above; ours have 10 to 60.
-        build: Makes its content, for one visitor, into the present element of NiceGUI.
-        emulated_only: Whether it needs emulated machines; it is left out for drives on a bus.
-        attach: Adds routes of its own to the web application, websockets for one; it is called once.
+        icon: Name of a Material icon.
+        order: Its place in the navigation, from the top; our pages have 10 to 60.
+        build: Builds its content, for one visitor, in the present element of NiceGUI.
+        emulated_only: Whether it needs emulated machines; it is omitted for drives on a bus.
+        attach: Adds its own routes to the web application, such as websockets; called once.
     """
 
     path: str

@@ -1,4 +1,4 @@
-"""The pages that there are: those of this package, and those that others register in `drive_env.studio_pages`."""
+"""The pages of the studio: those of this package, and those registered in `drive_env.studio_pages`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ OWN = (axes, scope, dictionary, machine, runs)
 
 
 def studio_pages(*, emulated: bool) -> list[StudioPage]:
-    """Return the pages in their order; one that cannot be loaded is left out, and logged."""
+    """Return the pages in order; a page that cannot be loaded is omitted, and logged."""
     found = list(OWN)
     for entry in importlib.metadata.entry_points(group=ENTRY_POINTS):
         try:

@@ -1,7 +1,7 @@
-"""The thread of the pages: a page's computation delays other pages, but neither the quick stop nor a page's life line.
+"""The thread of the pages: long computations of a page delay other pages, but neither quick stop nor life lines.
 
-The web server takes requests in one event loop, in which nothing is computed; the pages live in another one, of a
-thread of its own.
+The web server receives requests in an event loop without computations; the pages run in another loop, in their own
+thread.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Send = Callable[[Any], Awaitable[None]]
 
 
 class PagesThread:
-    """An ASGI application that passes everything on to another one, which runs in the event loop of this thread.
+    """An ASGI application that passes requests to another one, which runs in the event loop of this thread.
 
     Args:
         app: The other one.
@@ -41,7 +41,7 @@ class PagesThread:
             await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(_awaited(send(message)), here))
 
         there = _awaited(self._app(scope, receive_there, send_there))
-        with contextlib.suppress(asyncio.CancelledError):  # the server ends, and waits for no page that computes
+        with contextlib.suppress(asyncio.CancelledError):  # at its end, the server does not wait for a busy page
             await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(there, self.loop))
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""Parts of pages that other packages add: cards on the page Tune, curves on the page Runs."""
+"""Parts of pages from other packages: cards on the page Tune, curves on the page Runs."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class StudioPart:
 
     Attributes:
         page: Path of the page.
-        order: Its place among the parts, from above.
-        build: Makes it into the present element; the page that takes parts defines the arguments.
+        order: Its place among the parts, from the top.
+        build: Builds it in the present element; the page that uses parts defines the arguments.
     """
 
     page: str
@@ -29,7 +29,7 @@ class StudioPart:
 
 
 def studio_parts(page: str) -> list[StudioPart]:
-    """Return the parts of a page in their order; one that cannot be loaded is left out, and logged."""
+    """Return the parts of a page in order; a part that cannot be loaded is omitted, and logged."""
     found: list[StudioPart] = []
     for entry in importlib.metadata.entry_points(group=ENTRY_POINTS):
         try:

@@ -1,8 +1,8 @@
-"""The open browser pages, and their motions: a motion lasts as long as its page says so.
+"""The open browser pages and their motions: a motion lasts only while its page confirms it.
 
-A page sends a beat every tenth of a second, and which button it holds. A page that is closed says goodbye, or its
-connection ends; one whose browser sleeps, or whose computer does, is silent. What moves by a job lasts as long as the
-page that began it. Times are of the monotonic clock [s].
+A page sends a beat every tenth of a second, with the button that it holds. A closed page says goodbye, or its
+connection ends; a page whose browser or computer sleeps is silent. Motions of a job last as long as the page that began
+it. Times are of the monotonic clock [s].
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ import numpy as np
 
 from mechanics.arrays import Mask
 
-HOLD = 0.5  # s without a beat after which what a page holds is stopped
-ASLEEP = 2.0  # s without a beat after which a page's motions that last as long as it is there are stopped
-ABANDONED = 5.0  # s without any page after which an axis that is enabled is stopped and disabled
+HOLD = 0.5  # s without a beat after which motions of a held button are stopped
+ASLEEP = 2.0  # s without a beat after which a page's other motions are stopped
+ABANDONED = 5.0  # s without any page after which enabled axes are stopped and disabled
 
 
 @dataclass
@@ -26,13 +26,13 @@ class PageMotion:
     """A motion of a page.
 
     Attributes:
-        number: Of this motion.
-        page: The page.
-        axes: Which axes it moves, shape (num_axes,).
-        held: Whether it lasts only as long as a button is held; otherwise as long as the page is there.
-        beat: When the page said last that it goes on [s].
-        why: Why it ended; empty while it lasts.
-        coupled: Whether several axes turn by it: none goes on without the others.
+        number: Number of this motion.
+        page: Page of the motion.
+        axes: Axes that it moves, shape (num_axes,).
+        held: Whether it lasts only while a button is held; otherwise it lasts as long as the page.
+        beat: Time at which the page last confirmed it [s].
+        why: Why it ended; "" while it lasts.
+        coupled: Whether several axes turn together, so that all stop if one is lost.
     """
 
     number: int
@@ -45,7 +45,7 @@ class PageMotion:
 
 
 class Presence:
-    """The pages there are; all methods may be called by any thread."""
+    """The open pages; all methods may be called from any thread."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -55,7 +55,7 @@ class Presence:
         self._last = time.monotonic()
 
     def beat(self, page: str, held: int = 0) -> None:
-        """Note that a page is there, and which motion it holds, 0 for none."""
+        """Record a page's beat, and the motion whose button it holds, 0 for none."""
         now = time.monotonic()
         with self._lock:
             self._beats[page] = self._last = now
@@ -72,26 +72,26 @@ class Presence:
                     motion.why = "its page was closed"
 
     def begin(self, page: str, axes: Mask, *, held: bool) -> PageMotion:
-        """Return a motion that begins now."""
+        """Begin a motion and return it."""
         with self._lock:
             motion = PageMotion(next(self._numbers), page, axes.copy(), held, time.monotonic())
             self._motions[motion.number] = motion
             return motion
 
     def couple(self, number: int) -> None:
-        """Note that the axes of a motion turn now: where they are several, none goes on without the others."""
+        """Mark a motion whose axes now turn: if there are several, all stop if one is lost."""
         with self._lock:
             motion = self._motions.get(number)
             if motion is not None:
                 motion.coupled = int(motion.axes.sum()) > 1
 
     def is_coupled(self) -> bool:
-        """Return whether any motion has axes none of which goes on without the others."""
+        """Return whether any motion has axes that must all stop if one is lost."""
         with self._lock:
             return any(motion.coupled for motion in self._motions.values())
 
     def lose(self, axes: Mask) -> None:
-        """Expire the coupled motions of axes that are not enabled any more."""
+        """Expire the coupled motions of axes that are no longer enabled."""
         with self._lock:
             for motion in self._motions.values():
                 if motion.coupled and not motion.why and np.any(motion.axes & axes):
@@ -99,13 +99,13 @@ class Presence:
                     motion.why = f"axis {lost} is not enabled any more, and none goes on without it"
 
     def stop(self, axes: Mask, why: str) -> None:
-        """Have axes stopped as those of a motion that expired, whatever moves them."""
+        """Have axes stopped like those of an expired motion, independent of their present motion."""
         with self._lock:
             number = next(self._numbers)
             self._motions[number] = PageMotion(number, "", axes.copy(), False, time.monotonic(), why)
 
     def end(self, number: int) -> PageMotion | None:
-        """Return a motion that its page has ended; None if it was over."""
+        """End a motion and return it; None if it was already over."""
         with self._lock:
             motion = self._motions.pop(number, None)
             if motion is not None and not motion.why:
@@ -113,7 +113,7 @@ class Presence:
             return motion
 
     def end_of_page(self, page: str, axes: Mask) -> None:
-        """Note that the end of a page ended its motions that last as long as it is there, on some axes."""
+        """Remove motions of some axes that last as long as this page, without stopping the axes."""
         with self._lock:
             for number, motion in list(self._motions.items()):
                 if motion.page == page and not motion.held and np.any(motion.axes & axes):
@@ -121,25 +121,25 @@ class Presence:
                     motion.why = motion.why or "ended"
 
     def end_all(self, axes: Mask) -> None:
-        """Note that axes are stopped: nothing of them goes on."""
+        """Remove the motions of axes that are being stopped."""
         with self._lock:
             for number in [n for n, motion in self._motions.items() if np.any(motion.axes & axes)]:
                 motion = self._motions.pop(number)
                 motion.why = motion.why or "stopped"
 
     def is_on(self, number: int) -> bool:
-        """Return whether a motion lasts."""
+        """Return whether a motion has begun and not ended."""
         with self._lock:
             motion = self._motions.get(number)
             return motion is not None and not motion.why
 
     def moves(self) -> bool:
-        """Return whether any page has set something in motion."""
+        """Return whether any page has a motion."""
         with self._lock:
             return bool(self._motions)
 
     def take_overdue(self) -> list[PageMotion]:
-        """Return and forget the motions whose page is gone or silent."""
+        """Return and remove the motions whose page is closed or silent."""
         now = time.monotonic()
         with self._lock:
             for motion in self._motions.values():
@@ -151,14 +151,14 @@ class Presence:
             return overdue
 
     def untaken(self) -> set[int]:
-        """Return the motions that `take_overdue` would return."""
+        """Return the numbers of the motions that `take_overdue` would return."""
         now = time.monotonic()
         with self._lock:
             motions = self._motions.values()
             return {one.number for one in motions if one.why or now - one.beat > (HOLD if one.held else ASLEEP)}
 
     def why_gone(self, page: str) -> str:
-        """Return why nothing goes on that a page has begun; empty while it is there, and awake."""
+        """Return why motions of a page must end; "" while the page is open and sends beats."""
         now = time.monotonic()
         with self._lock:
             beat = self._beats.get(page)
@@ -167,12 +167,12 @@ class Presence:
         return f"its page was silent for {now - beat:.1f} s" if now - beat > ASLEEP else ""
 
     def pages(self) -> int:
-        """Return how many pages are there."""
+        """Return the number of open pages."""
         now = time.monotonic()
         with self._lock:
             return sum(now - beat < ABANDONED for beat in self._beats.values())
 
     def is_abandoned(self) -> bool:
-        """Return whether no page has been there for so long that axes are not left enabled."""
+        """Return whether there has been no page for so long that enabled axes must be stopped."""
         with self._lock:
             return time.monotonic() - self._last > ABANDONED

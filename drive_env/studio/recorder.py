@@ -1,4 +1,4 @@
-"""Samples of the drives, in a ring: the newest minutes of some objects, at every communication cycle."""
+"""Samples of the drives in a ring buffer: the newest minutes of some objects, at every communication cycle."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from drive_env.drives.trace import Trace
 from mechanics.arrays import Floats, Integers
 
 CAPACITY = 120_000  # samples: two minutes at 1 kHz
-GAP = 1.5  # of the time between two samples: more is a gap
+GAP = 1.5  # of the time between two samples: a larger distance is a gap
 
 
 @dataclass(frozen=True)
 class RingSamples:
-    """Samples in a row.
+    """Consecutive samples.
 
-    first: Number of the first one since the ring began.
+    first: Number of the first sample since the ring began.
     t: Times [s], shape (n,).
     values: Integers of each object, shape (n, num_axes).
     """
@@ -33,24 +33,24 @@ class RingSamples:
 
 
 class SampleRing:
-    """The newest samples of some objects, as the wire carries them.
+    """The newest samples of some objects, as raw integers.
 
     Args:
         keys: The objects.
-        num_axes: Of the drives.
-        capacity: Samples that are kept.
+        num_axes: Number of axes.
+        capacity: Number of samples that are kept.
     """
 
     def __init__(self, keys: tuple[Key, ...], num_axes: int, capacity: int = CAPACITY) -> None:
         self.keys = keys
-        self.total = 0  # samples so far, those that are gone among them
+        self.total = 0  # samples so far, with those that were overwritten
         self._capacity = capacity
         self._t = np.zeros(capacity)
         self._values = np.zeros((capacity, len(keys), num_axes), np.int64)
 
     @property
     def oldest(self) -> int:
-        """The number of the oldest sample that is still there."""
+        """The number of the oldest sample that is kept."""
         return max(0, self.total - self._capacity)
 
     def append(self, t: Floats, values: dict[Key, Integers]) -> None:
@@ -63,7 +63,7 @@ class SampleRing:
         self.total += len(t)
 
     def read(self, first: int, last: int) -> RingSamples:
-        """Return the samples from one number to before another one, as far as they are there."""
+        """Return the samples from number `first` to before `last`, without those that are not kept."""
         first, last = max(first, self.oldest), min(last, self.total)
         places = np.arange(first, max(first, last)) % self._capacity
         values = self._values[places]
@@ -71,16 +71,16 @@ class SampleRing:
 
 
 class ScopeRecorder:
-    """Keeps the samples of every call that lets time pass; read by any thread.
+    """Records the samples of every call that lets time pass; read by any thread.
 
     Args:
-        num_axes: Of the drives.
+        num_axes: Number of axes.
         period: Time between two samples [s].
 
     Attributes:
         period: Time between two samples [s].
-        now: The time of the newest sample's end [s], since the beginning.
-        generation: Grows when other objects are sampled than before: numbers of samples begin anew.
+        now: End of the newest sample [s], since the beginning.
+        generation: Increases when other objects are sampled: numbers of samples then begin again.
     """
 
     def __init__(self, num_axes: int, period: float) -> None:
@@ -107,7 +107,7 @@ class ScopeRecorder:
         return self._ring
 
     def keep(self, trace: Trace, asked: tuple[Key, ...], start: float, end: float) -> None:
-        """Keep a trace that began and ended at times [s]; of objects that were asked for."""
+        """Add a trace that began and ended at times [s], with the objects that were asked for."""
         with self.lock:
             if asked != self._ring.keys:
                 self._ring = SampleRing(asked, self._num_axes)
@@ -117,7 +117,7 @@ class ScopeRecorder:
             self.now = end
 
     def newest(self) -> dict[Key, Integers]:
-        """Return the newest sample of each object, shape (num_axes,); empty before there is one."""
+        """Return the newest sample of each object, shape (num_axes,); empty before the first one."""
         with self.lock:
             rows = self._ring.read(self._ring.total - 1, self._ring.total)
         return {key: values[0] for key, values in rows.values.items()} if len(rows) else {}

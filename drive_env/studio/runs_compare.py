@@ -1,4 +1,4 @@
-"""Two runs side by side: the entries of their settings and certificates, and the differences."""
+"""Compares two runs: the entries of their settings and certificates, and the differences."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ SHOWN = 6  # digits
 
 
 def compare(one: Run, other: Run) -> list[tuple[str, str, str, bool]]:
-    """Return rows of name, value of one, value of the other, and whether they differ; the certificates first."""
+    """Return rows of name, both values, and whether they differ; the certificates first."""
     rows = []
     for mine, theirs in (
         (figures_of(certificate_of(one)), figures_of(certificate_of(other))),
@@ -25,7 +25,7 @@ def compare(one: Run, other: Run) -> list[tuple[str, str, str, bool]]:
 
 
 def figures_of(certificate: Mapping[str, Any]) -> dict[str, str]:
-    """Return the figures of a certificate by name, as its JSON has them: verdicts, gains, margins, steps."""
+    """Return the figures in a certificate's JSON by name: verdicts, gains, margins, steps."""
     found: dict[str, str] = {}
     for name in ("tuner", "device", "motor", "machine", "supply", "seed", "created"):
         if name in certificate:
@@ -54,7 +54,7 @@ def _axis(axis: Mapping[str, Any]) -> dict[str, str]:
 
 
 def verdict_of(axis: Mapping[str, Any]) -> str:
-    """Return the verdict of an axis of a certificate."""
+    """Return the verdict of an axis in a certificate."""
     if "verdict" in axis:
         return str(axis["verdict"])
     if not axis.get("accepted"):
@@ -63,7 +63,7 @@ def verdict_of(axis: Mapping[str, Any]) -> str:
 
 
 def text(value: Any) -> str:
-    """Return a value of a file for people."""
+    """Format a value of a file for display."""
     if value is None:
         return "not measured"
     if isinstance(value, float):

@@ -1,4 +1,4 @@
-"""The folder `runs/` for web pages: its runs, their files, and no way out of it."""
+"""The folder `runs/` for web pages: lists its runs and their files, and gives no access outside of it."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from mechanics.reading.untrusted import read_json, read_start, read_toml
 
 RUNS = Path("runs")
 ROUTE = "/studio/runs/"
-MOST_RUNS = 500  # that are listed; the newest
-MOST_FILES = 400  # of a run
-MOST_ENTRIES = 20_000  # of a run's folder that are looked at
+MOST_RUNS = 500  # that are listed, the newest
+MOST_FILES = 400  # per run
+MOST_ENTRIES = 20_000  # of a run's folder that are examined
 MOST_TEXT = 200_000  # bytes of a text that are shown
 MOST_READ = 8  # files of one name that are read for a page
 PICTURES, FILMS = (".png", ".jpg", ".jpeg", ".svg", ".webp", ".gif"), (".mp4", ".webm")
 TEXTS = (".toml", ".json", ".csv", ".txt", ".md", ".yaml", ".yml", ".log")
 REPORTS = (".html",)
-EVENTS = "events.out.tfevents."  # what TensorBoard's files begin with
-# What a page of a run may do: show its own text, styles and pictures; no script, no form, nothing of elsewhere.
+EVENTS = "events.out.tfevents."  # first part of the names of TensorBoard's files
+# Permissions of a page of a run: its own text, styles and pictures; no script, no form, nothing from other servers.
 POLICY = (
     "sandbox; default-src 'none'; img-src data: 'self'; media-src 'self'; style-src 'unsafe-inline'; font-src data:; "
     "frame-ancestors 'self'"
@@ -32,7 +32,7 @@ POLICY = (
 
 @dataclass(frozen=True)
 class RunFile:
-    """A file of a run: its path inside the run, its kind ("report", "picture", "film", "text", "other"), its bytes."""
+    """A file of a run: path in the run, kind ("report", "picture", "film", "text", "other"), size [bytes]."""
 
     path: str
     kind: str
@@ -41,7 +41,7 @@ class RunFile:
 
 @dataclass(frozen=True)
 class Run:
-    """A run: its name, when it was changed last [s since 1970], and its files."""
+    """A run: its name, the time of its last change [s since 1970], and its files."""
 
     name: str
     changed: float
@@ -49,7 +49,7 @@ class Run:
 
     @property
     def when(self) -> str:
-        """Date and time."""
+        """Date and time of its last change."""
         return time.strftime("%Y-%m-%d %H:%M", time.localtime(self.changed))
 
     def of(self, kind: str) -> list[RunFile]:
@@ -58,12 +58,12 @@ class Run:
 
     @property
     def has_events(self) -> bool:
-        """Whether a training writes or wrote its curves here."""
+        """Whether it has TensorBoard files of a training."""
         return any(Path(file.path).name.startswith(EVENTS) for file in self.files)
 
 
 def kind_of(path: Path) -> str:
-    """Return a file's kind by its ending: report, picture, film, text or other."""
+    """Return a file's kind by its suffix: report, picture, film, text or other."""
     ending = path.suffix.lower()
     for kind, endings in (("report", REPORTS), ("picture", PICTURES), ("film", FILMS), ("text", TEXTS)):
         if ending in endings:
@@ -72,7 +72,7 @@ def kind_of(path: Path) -> str:
 
 
 def list_runs(root: Path = RUNS) -> list[Run]:
-    """Return the runs, the newest first: folders of `root`, and single files in it as one run each."""
+    """Return the runs, the newest first: folders in `root`, and each single file in it as a run."""
     if not root.is_dir():
         return []
     found = []
@@ -85,7 +85,7 @@ def list_runs(root: Path = RUNS) -> list[Run]:
 
 
 def find_run(name: str, root: Path = RUNS) -> Run | None:
-    """Return the run of a name, None if there is no such run."""
+    """Return the run with a name; None if it does not exist."""
     try:
         path = confined(name, root)
     except ValueError:
@@ -96,10 +96,10 @@ def find_run(name: str, root: Path = RUNS) -> Run | None:
 
 
 def confined(name: str, root: Path = RUNS) -> Path:
-    """Return a path inside the folder of runs.
+    """Resolve a path inside the folder of runs.
 
     Raises:
-        ValueError: For one that leads out of it, by dots or by a link, or that the file system takes for no name.
+        ValueError: For a path outside of it, by dots or by a link, or an invalid file name.
     """
     base = root.resolve()
     try:
@@ -107,7 +107,7 @@ def confined(name: str, root: Path = RUNS) -> Path:
         if path == base or not path.is_relative_to(base):
             raise ValueError(f"{name} is not in {root}")
         path.exists()
-    except (OSError, RuntimeError, UnicodeError) as error:  # a name that is too long, or a ring of links
+    except (OSError, RuntimeError, UnicodeError) as error:  # a name that is too long, or circular links
         raise ValueError(f"{name[:100]} is no name of a file in {root}: {error}") from None
     return path
 
@@ -118,7 +118,7 @@ def url_of(run: str, path: str = "") -> str:
 
 
 def media_type(path: Path) -> str:
-    """Return the type under which a file is sent; nothing that a browser would run."""
+    """Return the media type with which a file is sent; never one that a browser would execute."""
     if kind_of(path) == "text":
         return "text/plain; charset=utf-8"
     found, _ = mimetypes.guess_type(path.name)
@@ -127,14 +127,14 @@ def media_type(path: Path) -> str:
 
 
 def text_of(path: Path) -> str:
-    """Return the text of a file, its beginning if it is long."""
+    """Return the text of a file, only its beginning if it is long."""
     content = read_start(path, MOST_TEXT + 1)
     text = content[:MOST_TEXT].decode("utf-8", "replace")
     return text if len(content) <= MOST_TEXT else text + "\n… (the file goes on)"
 
 
 def settings_of(run: Run, root: Path = RUNS) -> dict[str, str]:
-    """Return the settings of a run as flat names and texts; empty where it has none."""
+    """Return the settings of a run as flat names and texts; empty without settings."""
     found: dict[str, str] = {}
     for file in _named(run, "settings.toml", "config.toml", "args.toml"):
         try:
@@ -145,7 +145,7 @@ def settings_of(run: Run, root: Path = RUNS) -> dict[str, str]:
 
 
 def certificate_of(run: Run, root: Path = RUNS) -> dict[str, Any]:
-    """Return the certificate of a run as its JSON has it; empty where it has none that can be read."""
+    """Return the certificate of a run as parsed JSON; empty without a readable one."""
     for file in _named(run, "certificate.json", "stepper-certificate.json"):
         try:
             data = read_json(confined(f"{run.name}/{file.path}", root))
@@ -157,7 +157,7 @@ def certificate_of(run: Run, root: Path = RUNS) -> dict[str, Any]:
 
 
 def _named(run: Run, *names: str) -> list[RunFile]:
-    """Return the first files of a run that have one of these names and are short enough for a page."""
+    """Return the first files of a run with one of these names that are short enough for a page."""
     found = [file for file in run.files if Path(file.path).name in names and file.size < MOST_TEXT]
     return found[:MOST_READ]
 

@@ -29,7 +29,7 @@ from drive_env.studio.runs_folder import (
 from drive_env.studio.session import Session
 from drive_env.studio.visitor import Visitor
 
-REFRESH = 3.0  # s between two looks at the folder
+REFRESH = 3.0  # s between two readings of the folder
 EXTRA = "Learning curves need TensorBoard: pip install 'drive-env[agents]'"
 HEADERS = {
     "Content-Security-Policy": POLICY,
@@ -41,7 +41,7 @@ HEADERS = {
 
 
 def attach(web: FastAPI, session: Session) -> None:
-    """Add the way by which files of runs come to the page."""
+    """Add the route for files of runs to the web application."""
 
     @web.get(ROUTE + "{path:path}")
     def file(path: str) -> Response:
@@ -55,7 +55,7 @@ def attach(web: FastAPI, session: Session) -> None:
 
 
 def build(session: Session, visitor: Visitor) -> None:
-    """Make the page."""
+    """Build the page."""
     ui.add_head_html('<link rel="stylesheet" href="/studio/assets/pages.css">')
     request = visitor.client.request
     RunsPanel(visitor, "" if request is None else request.query_params.get("run", "")).build()
@@ -66,16 +66,16 @@ class RunsPanel:
 
     Args:
         visitor: The page.
-        chosen: Name of the run that is shown first; the newest one for "".
+        chosen: Name of the run to show first; "" selects the newest.
     """
 
     def __init__(self, visitor: Visitor, chosen: str) -> None:
         self._visitor = visitor
         self._chosen, self._other = chosen, ""
-        self._known: list[tuple[str, float, int]] | None = None  # before the first look
+        self._known: list[tuple[str, float, int]] | None = None  # None before the first reading
 
     def build(self) -> None:
-        """Make it."""
+        """Build the page."""
         with ui.element("div").classes("studio-runs"):
             with ui.card().classes("studio-card card-runs"):
                 ui.label("Runs").classes("studio-heading").props('role="heading" aria-level="2"')
@@ -88,7 +88,7 @@ class RunsPanel:
         ui.timer(REFRESH, self._look, immediate=True)
 
     async def _look(self) -> None:
-        """Look at the folder, and show its changes."""
+        """Read the folder, and show its changes."""
         found = await run.io_bound(list_runs, RUNS)
         wanted = str(self._find.value or "").lower()
         runs = [one for one in found or [] if wanted in one.name.lower()]
@@ -192,7 +192,7 @@ def _show_run(run: Run) -> None:
 
 
 def _report(run: Run, file: RunFile) -> None:
-    """Show a report in a frame that may run nothing."""
+    """Show a report in a frame without permission to run scripts."""
     address = url_of(run.name, file.path)
     ui.link(f"{file.path or run.name} in a tab of its own", address, new_tab=True).classes("studio-open")
     frame = ui.element("iframe").classes("studio-report")

@@ -1,4 +1,4 @@
-"""A scope's picture as a table, as arrays, as an image; and the figures of a step in it."""
+"""Exports a scope's recording as table, arrays or image, and computes the figures of a step in it."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from drive_env.trials.response import step_metrics
 
 COLOURS = ("#0072b2", "#d55e00", "#007a59", "#a3447f", "#8a6100", "#1f1f1f", "#3a86b8", "#7a3b12")
 
-LEAST_STEP = 0.3  # of all that a channel does between the cursors: less is no step but a pulse, or noise
+LEAST_STEP = 0.3  # of a channel's range between the cursors: a smaller change is a pulse or noise, not a step
 
 
 def as_csv(recording: ScopeRecording) -> bytes:
-    """Return a table: times [s], then a column for each channel in its unit."""
+    """Return a CSV table: times [s], then a column for each channel in its unit."""
     file = io.StringIO()
     writer = csv.writer(file)
     writer.writerow(["t [s]", *(channel.label for channel, _ in recording.values)])
@@ -42,7 +42,7 @@ def as_npz(recording: ScopeRecording) -> bytes:
 
 
 def as_png(recording: ScopeRecording, under: ScopeRecording | None = None) -> bytes:
-    """Return an image: a panel for each unit, another recording dashed under it."""
+    """Return an image with a panel for each unit, and another recording dashed below."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -73,7 +73,7 @@ def as_png(recording: ScopeRecording, under: ScopeRecording | None = None) -> by
 
 
 class StepFigures(NamedTuple):
-    """The figures of a step, nan where one does not exist; times in s, overshoot as a share of the step."""
+    """The figures of a step, nan for one that does not exist; times in s, overshoot as a share of the step."""
 
     at: float
     height: float
@@ -86,17 +86,17 @@ class StepFigures(NamedTuple):
 def measure_step(
     recording: ScopeRecording, channel: ScopeChannel, begin: float | None, end: float | None
 ) -> StepFigures:
-    """Return the figures of the step that a channel makes.
+    """Return the figures of the step of a channel.
 
     Args:
-        recording: The picture.
+        recording: The recording.
         channel: The response.
-        begin: From when on it is looked at [s]; None: from the beginning of the picture. The step comes at the trigger,
-            if that lies there, else where the channel first leaves its beginning.
-        end: Up to when it is looked at [s]; None: to the end of the picture.
+        begin: Begin of the evaluation [s]; None: begin of the recording. The step is at the trigger, if that lies
+            inside, else where the channel first leaves its first value.
+        end: End of the evaluation [s]; None: end of the recording.
 
     Raises:
-        ValueError: Where there is no step.
+        ValueError: If there is no step.
     """
     values, t = recording.of(channel), recording.t
     if values is None or len(t) < 10:
@@ -122,7 +122,7 @@ def measure_step(
 
 
 def _start(t: np.ndarray, values: np.ndarray, first: int, last: int) -> int:
-    """Return the sample at the trigger, or before the channel first leaves its beginning."""
+    """Return the sample at the trigger, or the last one before the channel leaves its first value."""
     if t[first] < 0.0 < t[last - 1]:
         return int(np.searchsorted(t, 0.0, side="right")) - 1
     shown = values[first:last]
@@ -131,7 +131,7 @@ def _start(t: np.ndarray, values: np.ndarray, first: int, last: int) -> int:
 
 
 def in_words(figures: StepFigures, unit: str) -> str:
-    """Return the figures as a line."""
+    """Format the figures as a line."""
 
     def time_text(value: float) -> str:
         return "none" if math.isnan(value) else f"{1e3 * value:.4g} ms"

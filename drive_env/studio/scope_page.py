@@ -1,4 +1,4 @@
-"""The page Scope: live at the communication rate, triggers, cursors, figures of a step, recordings to keep."""
+"""The page Scope: live at the communication rate, triggers, cursors, figures of a step, stored recordings."""
 
 from __future__ import annotations
 
@@ -40,19 +40,19 @@ from drive_env.studio.workspace import CHOICES, OF_VL, AxisSettings, object_key,
 from mechanics.reading.untrusted import parse_json
 
 FRAME = 0.05  # s between two frames
-LIVE = 5.0  # s across the plot of the page Axes
+LIVE = 5.0  # s across the plot on the page Axes
 UNITS_REFRESH = 0.5  # s
-FIRST = (  # of the objects that can be chosen, those that people look for
+FIRST = (  # objects listed first in the choice
     cia402.POSITION_DEMAND, cia402.POSITION_ACTUAL, cia402.VELOCITY_DEMAND, cia402.VELOCITY_ACTUAL,
     cia402.TARGET_VELOCITY, cia402.TORQUE_DEMAND, cia402.TORQUE_ACTUAL, cia402.FOLLOWING_ERROR, cia402.STATUSWORD,
     cia402.DC_LINK_VOLTAGE, cia402.VL_TARGET_VELOCITY, *OF_VL,
 )  # fmt: skip
 
-_views: dict[str, ScopeView] = {}  # of each page that is open, by its visitor's id
+_views: dict[str, ScopeView] = {}  # of each open page, by its visitor's id
 
 
 def attach(web: FastAPI, session: Session) -> None:
-    """Add the way by which frames come to the page."""
+    """Add the websocket for frames to the web application."""
 
     @web.websocket("/studio/scope")
     async def frames(line: WebSocket, page: str = "") -> None:
@@ -74,7 +74,7 @@ def attach(web: FastAPI, session: Session) -> None:
 
 
 async def _listen(line: WebSocket, view: ScopeView) -> None:
-    """Hear how wide the picture is."""
+    """Receive the width of the picture."""
     with contextlib.suppress(WebSocketDisconnect, ValueError, KeyError, TypeError):
         while True:
             message = parse_json(await line.receive_text())
@@ -82,7 +82,7 @@ async def _listen(line: WebSocket, view: ScopeView) -> None:
 
 
 def traces(visitor: Visitor, view: ScopeView, size: str = "") -> None:
-    """Show the traces of a scope on a page; `size` is a class of it."""
+    """Show the traces of a scope on a page; `size` is its CSS class."""
     _views[visitor.id] = view
     with ui.element("div").classes(f"studio-scope {size}"):
         ui.element("canvas").props('tabindex="0" role="img" aria-label="Traces of the chosen objects"')
@@ -90,7 +90,7 @@ def traces(visitor: Visitor, view: ScopeView, size: str = "") -> None:
 
 
 def live_plot(session: Session, visitor: Visitor) -> None:
-    """Show the latest position, velocity and current of the axis of a page, as far as they are sampled anyway."""
+    """Plot the newest position, velocity and current of a page's axis, if they are sampled anyway."""
     known, view = session.description.dictionary, ScopeView(session.recorder)
     scale, units = session.scales[visitor.axis], session.workspace.units
     keys = [key for key in session.workspace.usual_channels if key in session.recorder.objects]
@@ -108,7 +108,7 @@ def live_plot(session: Session, visitor: Visitor) -> None:
 
 
 def build(session: Session, visitor: Visitor) -> None:
-    """Make the page."""
+    """Build the page."""
     ScopePanel(session, visitor).build()
 
 
@@ -128,7 +128,7 @@ class ScopePanel:
         self._sampled = f"the scope of axis {visitor.axis}"
 
     def build(self) -> None:
-        """Make it."""
+        """Build the page."""
         self._visitor.client.on_delete(self._leave)
         self._want()
         with ui.element("div").classes("studio-scope-page"):
@@ -144,9 +144,9 @@ class ScopePanel:
         ui.on("scope_cursors", self._take_cursors)
 
     def _view_of(self, session: Session, axis: int) -> ScopeView:
-        """Return the scope of an axis as its settings have it; a trigger that is set is armed.
+        """Create the scope of an axis from its settings, with its trigger armed.
 
-        Objects that cannot be sampled are left out. A trigger whose level means nothing is not set: the page says so.
+        Objects that cannot be sampled are omitted. A trigger with an invalid level is not set; the page reports it.
         """
         settings = session.workspace.of(axis)
         view = session.scopes[axis] = ScopeView(session.recorder)
@@ -161,7 +161,7 @@ class ScopePanel:
         return view
 
     def _level(self, settings: AxisSettings) -> float:
-        """Return the level of an edge as the integer that the wire carries; ValueError for another text."""
+        """Return the level of an edge as a raw integer; ValueError for an invalid text."""
         if settings.edge not in ("rising", "falling"):
             return 0.0
         if settings.source not in self._entries:
@@ -170,7 +170,7 @@ class ScopePanel:
         return float(quantities.parse(settings.level, entry, self._session.scales[self._visitor.axis]))
 
     def _leave(self) -> None:
-        """Sample nothing for the scope any more, unless it waits for its trigger or another page shows it."""
+        """Stop sampling for the scope, unless it waits for its trigger or another page shows it."""
         _views.pop(self._visitor.id, None)
         if not self._view.is_armed and self._view not in _views.values():
             self._session.forget_samples(self._sampled)
@@ -231,7 +231,7 @@ class ScopePanel:
         ui.html(table, sanitize=False).classes("w-full studio-scroll")
 
     def _move_card(self) -> None:
-        """Enable and move the axis beside its traces."""
+        """Build the cards that enable and move the axis beside its traces."""
         with card("Move", "card-move"):
             power_row(self._visitor)
             move_rows(self._session, self._visitor)
@@ -423,7 +423,7 @@ class ScopePanel:
 
 
 def _choices(session: Session) -> dict[tuple[int, int], Entry]:
-    """Return the objects that a scope can show: numbers that can be sampled, those that people look for first."""
+    """Return the objects that a scope can show: numbers that can be sampled, the usual ones first."""
     known = session.description
     entries = [entry for entry in known.dictionary if fits_pdo(entry, transmit=True) and entry.bits is not None]
     entries.sort(key=lambda one: (one.index not in FIRST, one.index, one.sub))
@@ -431,7 +431,7 @@ def _choices(session: Session) -> dict[tuple[int, int], Entry]:
 
 
 def _response(labels: list[str]) -> str | None:
-    """Return the channel whose step is measured most: the position, which a move leaves at another place."""
+    """Return the default channel for a step's figures: the actual position, since a move ends at another value."""
     return next((one for one in labels if "osition actual" in one), labels[0] if labels else None)
 
 

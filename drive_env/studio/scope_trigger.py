@@ -1,4 +1,4 @@
-"""When a scope's picture begins: an edge through a level, a change of state, a fault."""
+"""The trigger of a scope: an edge through a level, a change of state, a fault."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from drive_env.cia402 import Key
 from mechanics.arrays import Integers
 
 EDGES = {"rising": "rising edge", "falling": "falling edge", "state": "change of state", "fault": "fault"}
-# State by the low seven bits of a statusword; -1 for none.
+# State by the low seven bits of a statusword; -1 for an invalid one.
 _STATES = np.array([-1 if (state := cia402.state_of(word)) is None else int(state) for word in range(128)], np.int64)
 
 
 @dataclass(frozen=True)
 class ScopeTrigger:
-    """The condition that starts a picture.
+    """The condition that starts a recording.
 
     Attributes:
         kind: A name of `EDGES`.
-        axis: Whose object it looks at.
+        axis: Axis of the object.
         key: The object; the statusword for a change of state and a fault.
-        level: Integer that an edge passes; without meaning for the others.
+        level: Raw value that an edge must pass; unused for other kinds.
     """
 
     kind: str
@@ -37,10 +37,10 @@ class ScopeTrigger:
 
 
 def first_fired(trigger: ScopeTrigger, values: Integers) -> int | None:
-    """Return at which of some samples a trigger fires first, None for nowhere; the first one has none before it.
+    """Return the index of the first sample at which a trigger fires, None if it does not; never the first sample.
 
     Args:
-        trigger: What is looked for.
+        trigger: The trigger.
         values: Samples of its object on its axis, shape (n,).
     """
     if len(values) < 2:

@@ -1,6 +1,6 @@
-"""The scope of one axis: channels in their units, rolling or from a trigger on, and recordings to keep.
+"""The scope of one axis: channels in their units, rolling or triggered, and stored recordings.
 
-It reads the recorder, and touches no drive.
+It reads the recorder, and accesses no drive.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from mechanics.arrays import Floats
 MOST_CHANNELS = 8
 WINDOWS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 60.0)  # s
 MODES = {"roll": "rolling", "auto": "auto", "normal": "normal", "single": "single"}
-AUTO_WAIT = 1.0  # s without a trigger after which auto shows the samples there are
-STEPS = 65_000  # of the integers that a value becomes on its way to the page
+AUTO_WAIT = 1.0  # s without a trigger after which auto shows the newest samples
+STEPS = 65_000  # integer steps to which a value is quantised for the page
 
 
 @dataclass(frozen=True)
 class ScopeChannel:
-    """An object of an axis on the scope, and how an integer becomes a value: factor, unit."""
+    """An object of an axis on the scope, with unit and factor that convert an integer to a value."""
 
     key: Key
     axis: int
@@ -46,13 +46,13 @@ class ScopeChannel:
 
 @dataclass(frozen=True)
 class ScopeRecording:
-    """A picture that was kept: times from the trigger [s], shape (n,), and each channel's values, shape (n,)."""
+    """A stored recording: times from the trigger [s], shape (n,), and each channel's values, shape (n,)."""
 
     t: Floats
     values: tuple[tuple[ScopeChannel, Floats], ...]
 
     def of(self, channel: ScopeChannel) -> Floats | None:
-        """Return the values of a channel, None where it was not recorded."""
+        """Return the values of a channel; None if it was not recorded."""
         return next((values for one, values in self.values if one == channel), None)
 
 
@@ -68,22 +68,22 @@ def channel_of(
 
 
 class ScopeView:
-    """The scope of an axis; the pages that show it share it.
+    """The scope of an axis; pages that show it share it.
 
     Args:
-        recorder: What is sampled.
+        recorder: The recorder of the samples.
 
     Attributes:
-        channels: What is shown, eight at most.
-        window: Time across the picture [s].
-        before: Share of it that lies before the trigger.
-        trigger: What starts a picture; it counts unless the mode is "roll".
+        channels: Displayed channels, at most eight.
+        window: Duration of a recording [s].
+        before: Share of it before the trigger.
+        trigger: Trigger of a recording; unused in the mode "roll".
         mode: A name of `MODES`.
         is_running: Whether new samples are shown.
-        columns: Of pixels.
-        kept: The picture from the last trigger on, or the one at which it was halted.
-        reference: Another one, laid under it.
-        cursors: Times of A and B [s], None while they are not shown.
+        columns: Number of pixel columns.
+        kept: The recording of the last trigger, or of the halt; None without one.
+        reference: Another recording, shown below.
+        cursors: Times of A and B [s], None if they are hidden.
     """
 
     def __init__(self, recorder: ScopeRecorder) -> None:
@@ -99,12 +99,12 @@ class ScopeView:
         self.reference: ScopeRecording | None = None
         self.cursors: tuple[float | None, float | None] = (None, None)
         self._generation = recorder.generation
-        self._looked = recorder.ring.total  # samples that the trigger has seen
-        self._fired: int | None = None  # number of the sample at which it fired, while the rest is awaited
-        self._fired_at = recorder.now  # when there was a picture last [s]
+        self._looked = recorder.ring.total  # number of samples that the trigger has evaluated
+        self._fired: int | None = None  # sample at which it fired, while the rest of the recording is missing
+        self._fired_at = recorder.now  # time of the last recording [s]
         self._frame = 0
 
-    # --- what the page asks -----------------------------------------------------------------------------------------
+    # --- called by the page -----------------------------------------------------------------------------------------
     def run(self) -> None:
         """Show new samples from now on."""
         self.is_running = True
@@ -130,17 +130,17 @@ class ScopeView:
         return self.reference is not None
 
     def shown(self) -> ScopeRecording:
-        """Return the recording on display, at every sample."""
+        """Return the recording on display, with all samples."""
         return self.kept if self.kept is not None else self._rolling()
 
     @property
     def is_armed(self) -> bool:
-        """Whether it waits for its trigger, or for the rest of the picture from there on."""
+        """Whether it waits for its trigger, or for the rest of a recording."""
         return self.is_running and self.mode != "roll" and self.trigger is not None
 
     @property
     def status(self) -> str:
-        """Its state, in a word or two."""
+        """Its state in a few words."""
         if not self.is_running:
             return "halted"
         if self.mode == "roll":
@@ -151,10 +151,10 @@ class ScopeView:
 
     # --- time ------------------------------------------------------------------------------------------------------
     def step(self) -> None:
-        """Look at the samples that have come."""
+        """Process new samples."""
         recorder = self._recorder
         with recorder.lock:
-            if recorder.generation != self._generation:  # other objects are sampled: numbers begin anew
+            if recorder.generation != self._generation:  # other objects are sampled: numbers begin again
                 self._generation, self._looked, self._fired = recorder.generation, 0, None
             if not self.is_armed or self.trigger is None:
                 return
@@ -176,7 +176,7 @@ class ScopeView:
             self._fired = rows.first + found
 
     def _complete(self) -> None:
-        """Keep the picture once all of it is there."""
+        """Store the recording when all its samples exist."""
         ring, period = self._recorder.ring, self._recorder.period
         assert self._fired is not None
         count = round(self.window / period)
@@ -193,7 +193,7 @@ class ScopeView:
             self.is_running = False
 
     def _rolling(self) -> ScopeRecording:
-        """Return the newest samples, times up to now."""
+        """Return the newest samples, with times relative to now."""
         with self._recorder.lock:
             rows = self._newest()
         return self._recording(rows, float(rows.t[-1]) if len(rows) else 0.0)
@@ -209,9 +209,10 @@ class ScopeView:
 
     # --- the picture -----------------------------------------------------------------------------------------------
     def frame(self) -> bytes:
-        """Return the picture as bytes: length of the header, the header as JSON, integers of 16 bits.
+        """Return the picture as bytes: length of the header, the header as JSON, 16-bit integers.
 
-        Of each trace the least of each column, then the greatest; they lie between `low` and `high` of the header.
+        For each trace the least value of each column, then the greatest; they are scaled between `low` and `high` of
+        the header.
         """
         self.step()
         self._frame += 1
@@ -237,7 +238,7 @@ class ScopeView:
         return struct.pack("<I", len(text)) + text + b"".join([*blobs, *more])
 
     def _traces(self, recording: ScopeRecording, first: int) -> tuple[list[dict[str, Any]], list[bytes]]:
-        """Return each channel's trace as entries of the header and as integers."""
+        """Return each channel's trace as an entry of the header, and as integers."""
         traces, blobs = [], []
         stride = stride_of(len(recording.t), self.columns)
         for channel, values in recording.values:
@@ -250,7 +251,7 @@ class ScopeView:
             blobs += [np.rint((one - low) / step - STEPS / 2).astype("<i2").tobytes() for one in both]
             t = recording.t[columns.starts]
             every = stride * self._recorder.period
-            nominal = float(t[1]) - every if len(t) > 1 else float(t[0])  # the first column may be a part of one
+            nominal = float(t[1]) - every if len(t) > 1 else float(t[0])  # the first column may be incomplete
             broken = np.flatnonzero(np.diff(t) > GAP * every) + 1
             traces.append({
                 "channel": self.channels.index(channel), "count": len(t), "thick": stride > 1,
@@ -261,7 +262,7 @@ class ScopeView:
 
 
 def with_channels(view: ScopeView, channels: tuple[ScopeChannel, ...]) -> None:
-    """Show other channels.
+    """Set the displayed channels.
 
     Raises:
         ValueError: For more than eight.
@@ -274,7 +275,7 @@ def with_channels(view: ScopeView, channels: tuple[ScopeChannel, ...]) -> None:
 
 
 def with_units(view: ScopeView, channels: tuple[ScopeChannel, ...]) -> None:
-    """Show the same channels in other units, what is kept of them, too."""
+    """Show the same channels in other units, also in stored recordings."""
     new = {one.key: one for one in channels}
 
     def of(recording: ScopeRecording | None) -> ScopeRecording | None:
@@ -287,5 +288,5 @@ def with_units(view: ScopeView, channels: tuple[ScopeChannel, ...]) -> None:
 
 
 def moved(recording: ScopeRecording, by: float) -> ScopeRecording:
-    """Return a recording with its times moved [s]."""
+    """Return a recording with its times shifted [s]."""
     return replace(recording, t=recording.t + by)

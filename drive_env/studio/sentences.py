@@ -1,4 +1,4 @@
-"""Errors as one plain sentence with the remedy, for people at a web page."""
+"""Formats errors as one plain sentence with the remedy, for users of a web page."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import logging
 
 logger = logging.getLogger(__name__)
 
-# Remedies for Python, and their forms on a page.
+# Remedies in Python, and their equivalents on a page.
 _REMEDIES = (
     ("; see emergencies(), then reset_fault()", "; see the faults on the page Axes, then reset them"),
     ("; see emergencies()", "; see the faults on the page Axes"),
@@ -16,7 +16,7 @@ _REMEDIES = (
 
 
 def sentence(error: BaseException) -> str:
-    """Return an error as a sentence; one that is a mistake of this program is logged with its traceback."""
+    """Return an error as a sentence; errors of this program are logged with their traceback."""
     from drive_env.dictionary.aborts import ObjectAccessError
     from drive_env.fieldbus.errors import BusError
     from drive_env.safety.errors import SafetyError

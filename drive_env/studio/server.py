@@ -1,7 +1,7 @@
-"""The web server of the studio: its pages, the life line of each, and the quick stop that waits for nothing.
+"""The web server of the studio: its pages, the life line of each, and the quick stop, which waits for nothing.
 
-The event loop of the server takes requests and computes nothing. It hears the life lines and the quick stop itself;
-everything else goes to the pages, in a thread of their own (`pages_thread.py`), which may be busy as long as they like.
+The event loop of the server receives requests and computes nothing. It handles life lines and quick stop itself; all
+other requests go to the pages, in their own thread (`pages_thread.py`), which may be busy for any time.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ logger = logging.getLogger(__name__)
 ASSETS = Path(__file__).parent / "assets"
 PORT = 29640  # no service is registered there
 LOOPBACK = "127.0.0.1"
-GRACE = 1  # s that browsers get to close at the end
+GRACE = 1  # s for browsers to close their connections at the end
 RECONNECT = 3.0  # s
-LONGEST_END = 4.0  # s that the pages get to end: one that computes is not waited for
+LONGEST_END = 4.0  # s for the pages to end; a busy page is not waited for
 QUICK_STOP, LIFE = "/studio/quick-stop", "/studio/life"
 
 
@@ -51,7 +51,7 @@ class Studio:
 
     Args:
         session: The drives.
-        pages: In their order; the first one is where "/" leads.
+        pages: The pages in order; "/" leads to the first one.
     """
 
     def __init__(self, session: Session, pages: Iterable[StudioPage]) -> None:
@@ -79,9 +79,9 @@ class Studio:
             return Response(status_code=307, headers={"location": first})
 
     async def live(self, line: WebSocket, page: str) -> None:
-        """Receive a page's beats until it is gone: its motions end with it."""
+        """Receive a page's beats until it is closed; then its motions end."""
         await line.accept()
-        held: dict[int, int] = {}  # the page's number of a button that is held -> of its motion
+        held: dict[int, int] = {}  # the page's number of a held button -> number of its motion
         presence = self.session.presence
         presence.beat(page)
         try:
@@ -105,7 +105,7 @@ class Studio:
             self._release(page, held.pop(int(message["hold"]), 0))
 
     def _turn(self, page: str, message: dict[str, Any], held: dict[int, int]) -> None:
-        """Turn the axis of a page, or its group, as long as it holds the button."""
+        """Turn the axis of a page, or its group, while it holds the button."""
         hold, direction, is_group = int(message["hold"]), int(message["direction"]), bool(message.get("group"))
         visitor = self.visitors.get(page)
         if visitor is None or not self.session.num_axes:
@@ -124,10 +124,10 @@ class Studio:
 
 
 class _SlowPages(logging.Filter):
-    """Has NiceGUI tell in one line of a browser that answers late: it is busy, or asleep."""
+    """Shortens NiceGUI's log of a browser that answers late (busy or asleep) to one line."""
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Take the traceback from a record of a time-out."""
+        """Remove the traceback from the record of a time-out."""
         if record.exc_info and isinstance(record.exc_info[1], TimeoutError):
             record.msg, record.args = f"a page answers late: {record.exc_info[1]}", ()
             record.exc_info = record.exc_text = None
@@ -138,7 +138,7 @@ SLOW_PAGES = _SlowPages()
 
 
 class StudioServer(uvicorn.Server):
-    """Serves until a signal ends it: then the drives are stopped first."""
+    """Serves until a signal; then stops the drives first."""
 
     def __init__(self, config: uvicorn.Config, stop: Callable[[str], None]) -> None:
         super().__init__(config)
@@ -147,20 +147,20 @@ class StudioServer(uvicorn.Server):
     def handle_exit(self, sig: int, frame: FrameType | None = None) -> None:
         """Stop the drives, then end; a second Ctrl-C ends without waiting.
 
-        Uvicorn would raise the signal once more at its end: the process would die before the drives are closed.
+        Uvicorn would raise the signal again at its end: the process would die before the drives are closed.
         """
         self._stop("the studio ends")
         self.force_exit = self.should_exit and sig == signal.SIGINT
         self.should_exit = True
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """End the connections and the pages, and go on without those that do not end."""
+        """Close the connections and end the pages; continue without those that do not end in time."""
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(super().shutdown(sockets), LONGEST_END)
 
 
 def web_app(studio: Studio, host: str, port: int, token: str | None) -> StudioGate:
-    """Return the whole application: behind the gate, quick stop and life lines, and the pages."""
+    """Return the whole application: gate, quick stop and life lines, and the pages."""
     own, pages = _stops(studio), PagesThread(_pages(studio))
 
     async def behind(scope: Scope, receive: Receive, send: Send) -> None:
@@ -186,7 +186,7 @@ def _stops(studio: Studio) -> FastAPI:
 
 
 def _pages(studio: Studio) -> FastAPI:
-    """Return the pages."""
+    """Return the web application of the pages."""
     web = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
     for page in studio.pages:
         if page.attach is not None:
@@ -195,7 +195,7 @@ def _pages(studio: Studio) -> FastAPI:
         web, title="drive-env studio", dark=None, reconnect_timeout=RECONNECT, show_welcome_message=False,
         favicon=ASSETS / "studio.svg",
     )  # fmt: skip
-    # NiceGUI looks for its server among all objects there are, and one of python-canopen's cannot be looked at.
+    # NiceGUI searches its server among all Python objects, and inspecting one of python-canopen's raises an error.
     web.router.lifespan_context = _lifespan
     logging.getLogger("nicegui").addFilter(SLOW_PAGES)
     return web
@@ -209,10 +209,10 @@ async def _lifespan(_: FastAPI) -> AsyncIterator[None]:
 
 
 def listen(host: str, port: int) -> socket.socket:
-    """Return a socket that listens.
+    """Return a listening socket.
 
     Raises:
-        ValueError: Where that cannot be, with what to try.
+        ValueError: If the address or port cannot be used, with a remedy.
     """
     try:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
@@ -239,7 +239,7 @@ def address(host: str, port: int, token: str | None) -> str:
 
 
 class ServingTerms(NamedTuple):
-    """How it is served: on which address, with which token (None: none), for how long [s] (None: until a signal)."""
+    """The options of serving: address, token (None: not required), duration [s] (None: until a signal)."""
 
     host: str
     token: str | None = None
@@ -249,13 +249,13 @@ class ServingTerms(NamedTuple):
 def serve_studio(
     session: Session, pages: list[StudioPage], sock: socket.socket, terms: ServingTerms, ready: Callable[[], None]
 ) -> None:
-    """Serve a session until a signal comes; its drives are stopped and closed at the end, however it ends.
+    """Serve a session until a signal; its drives are stopped and closed at the end, also after an error.
 
     Args:
         session: The drives; they are opened here.
         pages: The pages.
-        sock: Listens already.
-        terms: How.
+        sock: Socket that already listens.
+        terms: Options of serving.
         ready: Called before the first request is served.
     """
     port = sock.getsockname()[1]
@@ -263,10 +263,10 @@ def serve_studio(
     web = web_app(studio, terms.host, port, terms.token)
     config = uvicorn.Config(web, log_level="warning", timeout_graceful_shutdown=GRACE, lifespan="on")
     server = StudioServer(config, session.stop_now)
-    hang_up = getattr(signal, "SIGHUP", None)  # a terminal that is closed ends it as Ctrl-C does
+    hang_up = getattr(signal, "SIGHUP", None)  # closing the terminal acts like Ctrl-C
     before = None if hang_up is None else signal.getsignal(hang_up)
     interval = sys.getswitchinterval()
-    sys.setswitchinterval(min(interval, SWITCH_INTERVAL))  # a page that computes gives the interpreter up that soon
+    sys.setswitchinterval(min(interval, SWITCH_INTERVAL))  # a busy page must release the interpreter after this time
     if hang_up is not None and before is not signal.SIG_IGN:
         signal.signal(hang_up, server.handle_exit)
     session.when_not_opened = lambda: server.handle_exit(signal.SIGTERM)

@@ -1,9 +1,9 @@
 """The session: the one set of drives that all browser pages share, in a thread of its own.
 
-Pages hand in jobs, functions of the drives; one runs at a time. Between jobs time passes: an emulated machine lives in
-real time, drives of a bus are sampled. What stops a motor does not wait for a job: `stop_now` acts from any thread, and
-the job that is under way ends at its next call. A job that moves axes belongs to the page that handed it in: it lasts
-no longer than that page, and one that fails leaves nothing in motion.
+Pages hand in jobs, functions of the drives; one runs at a time. Between jobs time passes: an emulated machine runs in
+real time, drives of a bus are sampled. Stopping a motor does not wait for a job: `stop_now` acts from any thread, and
+the running job ends at its next call. A job that moves axes belongs to its page: it ends with that page, and a job that
+fails leaves no axis in motion.
 """
 
 from __future__ import annotations
@@ -49,18 +49,18 @@ logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
-BUS_IDLE = 0.05  # s of a bus that are sampled at once between two looks for jobs
-RETRY = 0.5  # s after which a bus that failed is asked again
-STOP_WAIT = 3.0  # s that axes get to come to rest before their voltage is taken away
-KEPT = 200  # events
-TOLD_ONCE = 0.5  # s within which one more wish to stop is the same one
+BUS_IDLE = 0.05  # s, sampled at once on a bus between two checks for jobs
+RETRY = 0.5  # s until a failed bus is accessed again
+STOP_WAIT = 3.0  # s for axes to come to rest before their voltage is switched off
+KEPT = 200  # number of events
+TOLD_ONCE = 0.5  # s within which another request to stop counts as the same one
 PATIENCE = 10.0  # s for the thread to end
-WATCH = 0.2  # s between two looks whether the drives' thread has stopped what is overdue
+WATCH = 0.2  # s between two checks whether the drives' thread has stopped overdue motions
 
 
 @dataclass(frozen=True)
 class SessionEvent:
-    """An event: when (time of day [s]), how grave (info, warning, error), and its text."""
+    """An event: time of day [s], level (info, warning, error), and text."""
 
     at: float
     level: str
@@ -72,13 +72,13 @@ class Job:
     """A function of the drives, and its result.
 
     Attributes:
-        title: What it does, in a few words.
-        page: The page that wants it; what moves by it stops when that page is gone. "" for no page.
-        paced: Whether emulated time passes in real time meanwhile.
+        title: Its purpose in a few words.
+        page: Page that requested it; its motions stop with that page. "" for none.
+        paced: Whether emulated time passes in real time during it.
         quiet: Whether pages do not show it.
-        progress: Share that is done, None where it is not known.
-        told: What it says of itself.
-        stopped: Why it shall end; empty while it may go on.
+        progress: Share that is done, None if unknown.
+        told: Its present message.
+        stopped: Why it must end; "" while it may continue.
     """
 
     function: Callable[[Drives], Any]
@@ -90,10 +90,10 @@ class Job:
     progress: float | None = None
     told: str = ""
     stopped: str = ""
-    is_told: bool = False  # whether it has been stopped by an exception: what it puts back then must get through
+    is_told: bool = False  # whether the exception that stops it was raised: its cleanup must then be possible
 
     def refuse(self, error: BaseException) -> None:
-        """End it before it begins; the page that asked for it may have given it up."""
+        """Fail before it begins, unless its page has cancelled it."""
         if self.future.set_running_or_notify_cancel():
             self.future.set_exception(error)
 
@@ -103,21 +103,22 @@ class Session:
 
     Args:
         open_drives: Opens the drives, in the thread that will use them.
-        title: Their name, for people.
-        description: Of the device.
-        address: How drives of a bus were opened: interface, channel, nodes, bitrate; empty for emulated ones.
-        workspace: What is set on the pages; None begins with what is usual.
+        title: Name of the drives for display.
+        description: Description of the device.
+        address: Options that opened drives of a bus: interface, channel, nodes, bitrate; empty for emulated ones.
+        workspace: Settings of the pages; None begins with defaults.
 
     Attributes:
         state: "opening", "open", "failed", "closed".
-        failure: Why it failed.
-        error: What was raised where the drives could not be opened.
-        when_not_opened: Called then, by the drives' thread.
-        presence: The pages there are.
-        recorder: What is sampled.
-        stored: Parameters by axis, as far as it is known that the drive has them stored: those of the start.
-        scopes: The scope of each axis that a page has shown; it waits for its trigger while no page shows it.
-        at_end: Called by the drives' thread before the drives are closed, once nothing turns: what puts changes back.
+        failure: Why it failed, as text.
+        error: The exception if the drives could not be opened, else None.
+        when_not_opened: Called by the drives' thread in this case.
+        presence: The open pages.
+        recorder: The recorder of samples.
+        stored: Parameters by axis that the drive is known to have stored: those at the start.
+        scopes: The scope of each axis that a page has shown; it waits for its trigger even if no page shows it.
+        at_end: Functions that restore changes, called by the drives' thread before the drives are closed, when nothing
+            turns.
     """
 
     def __init__(
@@ -155,12 +156,12 @@ class Session:
         self._failed_at = self._told_at = -1e9
         self._sampled: dict[str, tuple[Key, ...]] = {}
         self._told_reason = ""
-        self._is_left = False  # whether an axis was switched off since no page is there
+        self._is_left = False  # whether axes were already switched off since the last page was closed
         self._thread = threading.Thread(target=self._run, name="drive studio", daemon=True)
         self._ended = threading.Event()
         self._watch = threading.Thread(target=self._watch_pages, name="drive studio watch", daemon=True)
 
-    # --- for pages, any thread ----------------------------------------------------------------------------------
+    # --- for pages, called from any thread ----------------------------------------------------------------------
     def start(self) -> None:
         """Open the drives."""
         self._thread.start()
@@ -181,17 +182,17 @@ class Session:
     def do(
         self, function: Callable[[Drives], T], title: str, *, page: str = "", paced: bool = True, quiet: bool = False
     ) -> Future[T]:
-        """Have a function of the drives run in their thread, after those that were asked for before.
+        """Run a function of the drives in their thread, after the jobs before it.
 
         Args:
-            function: What to do; it may let time pass, and is ended by an exception when the job is stopped.
-            title: What it does, in a few words: "Move axis 0".
-            page: Who wants it: its motion stops when that page is gone. "" for no page.
-            paced: Whether emulated time passes in real time meanwhile; a search is in a hurry.
-            quiet: Whether pages do not show it: one of many that only read.
+            function: The job; it may let time pass, and is ended by an exception when it is stopped.
+            title: Its purpose in a few words: "Move axis 0".
+            page: Page that requests it: its motions stop with that page. "" for none.
+            paced: Whether emulated time passes in real time during it; a search runs as fast as possible.
+            quiet: Whether pages do not show it, such as frequent readings.
 
         Returns:
-            What it returns, or raises: `JobEndedError` if it was stopped.
+            Future with its result or exception: `JobEndedError` if it was stopped.
         """
         job = Job(function, title, page, paced, quiet)
         with self._waiting:
@@ -203,12 +204,12 @@ class Session:
         return job.future
 
     def sample(self, page: str, keys: Iterable[Key]) -> None:
-        """Have objects sampled for a page, in place of those that it wanted before."""
+        """Set the objects to sample for a page, instead of its earlier ones."""
         self._sampled[page] = tuple(keys)
         self._choose_samples()
 
     def forget_samples(self, page: str) -> None:
-        """Sample nothing for a page any more."""
+        """Stop sampling objects for a page."""
         self._sampled.pop(page, None)
         self._choose_samples()
 
@@ -219,10 +220,10 @@ class Session:
             self.recorder.objects = (*states.sampled, *wanted)
 
     def stop_now(self, reason: str) -> None:
-        """Quick-stop every axis at once, and end the job that is under way and those that wait.
+        """Quick-stop all axes immediately, and end the running job and those that wait.
 
-        It does not wait for the job, nor long for anything else: those of a bus are commanded by the supervisor of
-        their envelope; emulated axes here, or by the thread that lets their time pass, before the next piece of it.
+        It does not wait for the job, and not long for anything else: axes of a bus are commanded by the supervisor of
+        their envelope; emulated axes here, or by the thread that lets their time pass, before its next piece.
         """
         with self._waiting:
             self._stop_asked = reason
@@ -243,30 +244,30 @@ class Session:
                 shared.lock.release()
 
     def end_job(self, reason: str) -> None:
-        """End the job that is under way, and stop every axis: it may have set any in motion."""
+        """End the running job, and stop all axes, since it may have moved any."""
         self.stop_now(reason)
 
     def tell(self, text: str, progress: float | None = None) -> None:
-        """Say how far the present job is; called by the job itself."""
+        """Set message and progress of the present job; called by the job itself."""
         if self._current is not None:
             self._current.told, self._current.progress = text, progress
 
     def check(self) -> None:
-        """End the present job if it was stopped; called by a job that computes for long between two calls of drives.
+        """End the present job if it was stopped; called by jobs that compute for long between two calls of drives.
 
         Raises:
-            JobStoppedError: If it was.
+            JobStoppedError: If it was stopped.
         """
         self._look()
 
     def glimpse(self, function: Callable[[Machines], T], patience: float = 1.0) -> T | None:
-        """Return the result of a function of emulated machines between two pieces of time; None if there is no moment.
+        """Return the result of a function of emulated machines between two pieces of time; None if `patience` runs out.
 
-        Any thread may call it. It only looks: what changes a machine is a job.
+        Any thread may call it. It must only read: changes of a machine need a job.
 
         Args:
-            function: It must be quick, since time stands still meanwhile.
-            patience: How long a moment is waited for [s].
+            function: It must be quick, since no time passes during it.
+            patience: Longest wait [s].
         """
         shared = self._drives
         if shared is None or shared.machine is None or not shared.lock.acquire(timeout=patience):
@@ -290,12 +291,12 @@ class Session:
 
     @property
     def waiting(self) -> int:
-        """How many jobs wait."""
+        """Number of waiting jobs."""
         return len(self._jobs)
 
     @property
     def is_emulated(self) -> bool:
-        """Whether there are emulated machines behind the drives."""
+        """Whether the drives are emulated."""
         return self._real is not None and self._real.machine is not None
 
     @property
@@ -309,7 +310,7 @@ class Session:
         return () if self._states is None else self._states.scales
 
     def plays(self, key: Key) -> bool:
-        """Return whether the drives take an object with every cycle; not every process image has room for it."""
+        """Return whether the drives accept an object in every cycle; a process image may lack it."""
         bus = None if self._real is None else self._real.bus
         with contextlib.suppress(ObjectAccessError):
             if bus is not None:
@@ -318,13 +319,13 @@ class Session:
         return False
 
     def forget_faults(self, axis: int) -> None:
-        """Note that the faults of an axis were reset."""
+        """Remove the faults of an axis, which were reset."""
         if self._states is not None:
             self._states.forget_faults(axis)
 
     @property
     def lateness(self) -> str:
-        """How many SYNCs of a bus were late since the start, in words; "" for none, and for emulated drives."""
+        """Share of late SYNCs of a bus since the start as text; "" for none, and for emulated drives."""
         bus = None if self._real is None else self._real.bus
         if bus is None or not bus.total_timing.late:
             return ""
@@ -348,7 +349,7 @@ class Session:
             return
         try:
             if self._real.bus is not None:
-                self.description = self._real.bus.description  # which knows the time between two SYNCs
+                self.description = self._real.bus.description  # it has the time between two SYNCs
             self.recorder = ScopeRecorder(self._real.num_axes, self.description.cycle)
             self._drives = SharedDrives(
                 self._real, self.recorder, self._look, self._hear, self.presence.moves, self._why_stopped
@@ -364,7 +365,7 @@ class Session:
                     self._idle()
                 else:
                     self._work(job)
-        except BaseException as error:  # nothing that a drive or a job does may end the thread
+        except BaseException as error:  # no error of a drive or a job may end the thread
             self.failure = sentence(error)
             logger.error("the session ends: %s", self.failure)
         finally:
@@ -414,14 +415,14 @@ class Session:
     def _work(self, job: Job) -> None:
         drives = self._drives
         assert drives is not None
-        if not job.future.set_running_or_notify_cancel():  # its page has given it up
+        if not job.future.set_running_or_notify_cancel():  # its page has cancelled it
             with self._waiting:
                 self._current = None
             return
         drives.paced, drives.moved = job.paced, np.zeros(self.num_axes, bool)
         try:
             result = job.function(drives)
-        except (KeyboardInterrupt, SystemExit) as error:  # which would end the event loop that waits for it
+        except (KeyboardInterrupt, SystemExit) as error:  # they would end the event loop that waits for it
             job.future.set_exception(JobEndedError(f"stopped: {error or job.stopped}"))
         except BaseException as error:
             if drives.moved.any() and not job.stopped:
@@ -435,7 +436,7 @@ class Session:
                 self._current = None
 
     def _idle(self) -> None:
-        """Let time pass for a moment, and look at the drives."""
+        """Let a short time pass, and process samples."""
         drives, states = self._drives, self._states
         assert drives is not None and states is not None
         if time.monotonic() - self._failed_at < RETRY:
@@ -451,7 +452,7 @@ class Session:
             pass
         except SafetyError as error:  # the envelope has stopped the drives
             self._tell_stop(error)
-        except Exception as error:  # a node that is gone: told, and tried again
+        except Exception as error:  # a missing node: reported, and tried again
             self._failed_at = time.monotonic()
             states.lose(error.silent if isinstance(error, NoAnswerError) else ())
             told = sentence(error)
@@ -459,12 +460,12 @@ class Session:
                 self.say("error", told)
 
     def _tell_stop(self, error: SafetyError) -> None:
-        """Report why the envelope has stopped the drives, unless a requested stop was reported a moment ago."""
+        """Report why the envelope has stopped the drives, unless a requested stop was just reported."""
         if time.monotonic() - self._told_at > STOP_WAIT or not str(error).startswith(self._told_reason):
             self.say("error", sentence(error))
 
     def _look(self) -> None:
-        """See to everything that must not wait for a job: called before each call and after each piece of time."""
+        """Do everything that must not wait for a job; called before each call and after each piece of time."""
         job = self._current
         if self._stop_asked:
             self._obey()
@@ -487,7 +488,7 @@ class Session:
             raise JobStoppedError(job.stopped)
 
     def _end_if_left(self, job: Job) -> None:
-        """End a job that moves axes and whose page is gone, or silent, and stop these axes."""
+        """End a job that moves axes and whose page is closed or silent, and stop these axes."""
         if why := self._why_left(job):
             assert self._drives is not None
             job.stopped = why
@@ -501,9 +502,9 @@ class Session:
         return self.presence.why_gone(job.page) if moves and job is not None and job.page else ""
 
     def _watch_pages(self) -> None:
-        """Stop everything where the drives' thread does not stop overdue motions: a call of its takes too long.
+        """Stop all axes if the drives' thread does not stop overdue motions because one of its calls takes too long.
 
-        On a bus set-points are played in one call, however long that takes.
+        On a bus, set-points are played in a single call of any duration.
         """
         before: set[object] = set()
         while not self._ended.wait(WATCH):
@@ -516,11 +517,11 @@ class Session:
             before = now
 
     def _why_stopped(self) -> str:
-        """Return why the present job was stopped, "" if it was not."""
+        """Return why the present job was stopped; "" if it was not."""
         return "" if self._current is None else self._current.stopped
 
     def _await_rest(self) -> None:
-        """Let emulated axes come to rest: a stopped job's clean-up takes their voltage away, and they would coast.
+        """Wait for rest of emulated axes: they would coast when a stopped job's cleanup switches their voltage off.
 
         Drives of a bus are brought to rest by the supervisor of their envelope.
         """
@@ -535,16 +536,16 @@ class Session:
                 waited += PIECE
 
     def _obey(self) -> None:
-        """Carry out a `stop_now` in this thread."""
+        """Execute a `stop_now` in this thread."""
         reason, self._stop_asked = self._stop_asked, ""
         now = time.monotonic()
-        if now - self._told_at > TOLD_ONCE:  # a page has two ways to ask
+        if now - self._told_at > TOLD_ONCE:  # a page sends each request on two ways
             self.say("warning", f"quick stop: {reason}")
         self._told_at, self._told_reason = now, reason
         self._stop(np.ones(self.num_axes, bool))
 
     def _leave_alone(self, job: Job | None) -> None:
-        """Stop and disable everything, since no page shows an axis that is enabled."""
+        """Stop and disable all axes, since no page shows an enabled axis."""
         if not self._is_left:
             self._is_left = True
             self.say("warning", "the last page was closed with an axis enabled: the axes were stopped and disabled")
@@ -555,20 +556,20 @@ class Session:
         self._bring_to_rest(self._real)
 
     def _stop(self, axes: Mask) -> None:
-        """Quick-stop axes that are live; past the look, which is where it is called from."""
+        """Quick-stop live axes; it bypasses `_look`, which calls it."""
         self.presence.end_all(axes)
         real, drives = self._real, self._drives
         assert real is not None and drives is not None
         try:
             with drives.lock:
                 _stop_live(real, axes)
-        except SafetyError as error:  # the envelope stops them already
+        except SafetyError as error:  # the envelope already stops them
             self._tell_stop(error)
-        except Exception as error:  # the bus is gone: the drive's watchdog acts
+        except Exception as error:  # the bus failed: the drive's watchdog acts
             self.say("error", sentence(error))
 
     def _bring_to_rest(self, real: Drives) -> None:
-        """Wait until no axis turns any more, then take the voltage away."""
+        """Wait until no axis turns, then switch the voltage off."""
         assert self._drives is not None
         try:
             with self._drives.lock:
@@ -593,7 +594,7 @@ class Session:
 
 
 def _stop_live(drives: Drives, axes: Mask | None = None) -> Mask:
-    """Quick-stop the axes that are in operation enabled; return those that may be live."""
+    """Quick-stop the axes in "operation enabled"; return those whose power stage may be on."""
     status = drives.read(cia402.STATUSWORD)
     live = np.asarray(cia402.is_live(status)) & (True if axes is None else axes)
     enabled = np.asarray(live & cia402.matches(status, cia402.OPERATION_ENABLED))

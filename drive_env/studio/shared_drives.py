@@ -1,6 +1,6 @@
-"""The drives as a job of the studio sees them: it can be stopped at any call, and all that passes is recorded.
+"""The drives' interface for jobs of the studio: any call can be stopped, and all time that passes is recorded.
 
-Emulated drives live in real time here, in pieces of 20 ms, unless a job is in a hurry; those of a bus do so by
+Emulated drives run in real time here, in pieces of 20 ms, unless a job wants full speed; drives of a bus do so by
 themselves.
 """
 
@@ -32,15 +32,15 @@ if TYPE_CHECKING:
     from drive_env.dictionary.entries import ObjectName
     from drive_env.drives.emergency import EmergencyMessage
 
-PIECE = 0.02  # s of emulated time between two looks at whether to go on
+PIECE = 0.02  # s of emulated time between two checks for stops
 BUS_PIECE = 0.1  # s of a recording on a bus, where nothing is played
-SEAMLESS = 0.004  # s between two recordings of a bus, whose SYNCs follow one another
-MOST_BEHIND = 0.1  # s; a computer that was slower does not catch up
+SEAMLESS = 0.004  # s, greatest distance of two recordings on a bus without a gap
+MOST_BEHIND = 0.1  # s; a slower computer does not catch up
 
 
 T = TypeVar("T")
 
-# Objects as they may be called.
+# All names of the objects.
 CONTROLWORDS = (cia402.CONTROLWORD, (cia402.CONTROLWORD, 0), "Controlword")
 SET_POINTS = frozenset(
     one
@@ -55,10 +55,10 @@ SET_POINTS = frozenset(
 
 
 def _operates(value: ArrayLike) -> bool:
-    """Return whether a controlword has an axis operate, and not halt."""
+    """Return whether a controlword enables operation without halt."""
     words = np.asarray(value)
     if words.dtype.kind not in "iu":
-        return True  # a text, whose meaning the drives know
+        return True  # a text, which the drives interpret
     return bool(np.any((words & 0x0F == cia402.ENABLE_OPERATION) & (words & cia402.HALT == 0)))
 
 
@@ -67,19 +67,19 @@ class SharedDrives(DrivesProxy):
 
     Args:
         drives: The drives, emulated or on a bus.
-        recorder: Keeps what is sampled.
-        look: Called between two pieces of time, by the thread whose calls these are; it may raise, which ends them.
+        recorder: Recorder of the samples.
+        look: Called between two pieces of time, by the calling thread; its exceptions end the call.
         hear: Called with all emergencies that were read.
-        moves: Returns whether a page moves an axis by a button that it holds, or as long as it is there.
-        stopped: Returns why the job under way was stopped, "" if it was not. It hears of that once, by `look`, so that
-            it can put back what it changed. Until it has ended it has no axis operate any more, and the envelope's own
-            error of the same stop, which would take the place of that, is not raised.
+        moves: Returns whether any page has a motion.
+        stopped: Returns why the running job was stopped, "" if it was not. The job gets this exception once, by `look`,
+            so that it can restore its changes. Until it has ended it cannot enable operation again, and the envelope's
+            own error for the same stop is not raised, since it would interrupt the restoring.
 
     Attributes:
-        lock: Held while emulated drives are called: a stop from another thread waits for a piece at most.
-        paced: Whether emulated time passes as fast as real time; otherwise as fast as it can.
-        moved: Axes that the present job may have set in motion, shape (num_axes,): by a controlword that has them
-            operate, or by a set-point.
+        lock: Held during calls of emulated drives: a stop from another thread waits for one piece at most.
+        paced: Whether emulated time passes in real time; otherwise at full speed.
+        moved: Axes that the present job may have moved, shape (num_axes,): by a controlword that enables operation, or
+            by a set-point.
     """
 
     def __init__(
@@ -102,7 +102,7 @@ class SharedDrives(DrivesProxy):
         self._stopped = stopped
         roles = drives.device.roles if drives.device is not None else {}
         self._set_points = SET_POINTS | {roles.get(Role.TARGET_INSIDE)}
-        self._refused: set[tuple[Key, ...]] = set()  # what cannot be sampled at once
+        self._refused: set[tuple[Key, ...]] = set()  # objects that cannot be sampled together
         self._due = time.perf_counter()
         self._start = time.monotonic()
 
@@ -117,7 +117,7 @@ class SharedDrives(DrivesProxy):
         """Write an object of every axis, or of some."""
         operates = name in CONTROLWORDS and _operates(value)
         before, moves = self.moved, self.moved | (True if where is None else where)
-        self.moved = moves if operates else before  # before the look, which keeps a page that is gone from it
+        self.moved = moves if operates else before  # set before `_look`, which ends the job if its page is closed
         self._look()
         if operates and (reason := self._stopped()):
             raise JobStoppedError(reason)
@@ -131,7 +131,7 @@ class SharedDrives(DrivesProxy):
             self.moved = moves
 
     def advance(self, duration: float) -> None:
-        """Let time pass [s], whole communication cycles; it is recorded."""
+        """Let time pass [s], whole communication cycles, and record it."""
         if not self._drives.time_waits:
             cycle = self._recorder.period
             duration = max(1, -int(-(duration + 1e-9) // cycle)) * cycle if duration > 0.0 else 0.0
@@ -145,14 +145,14 @@ class SharedDrives(DrivesProxy):
         play: Mapping[Any, ArrayLike] | None = None,
         period: float = 0.001,
     ) -> Trace:
-        """Let time pass [s] while objects are recorded and played, as `Drives.record`; the recorder sees it, too."""
+        """Let time pass [s] while objects are recorded and played, as `Drives.record`, also to the recorder."""
         if play:
             self.moved = np.ones(self.num_axes, bool)
         self._look()
         asked = tuple(object_names(objects))
         if self._drives.time_waits:
             return self._in_pieces(asked, duration, play, period, PIECE)
-        if play and self._moves():  # set-points go out in one piece, in which no page's silence would be noticed
+        if play and self._moves():  # played set-points are one piece, during which a silent page would not be noticed
             raise RuntimeError("a page moves an axis; end its jog, or its target, before set-points are played")
         return self._in_pieces(asked, duration, play, period, duration if play else BUS_PIECE)
 
@@ -182,9 +182,9 @@ class SharedDrives(DrivesProxy):
     def __exit__(self, *_: object) -> None:
         """Do nothing, as `close` does."""
 
-    # --- inside ---------------------------------------------------------------------------------------------------
+    # --- private methods ------------------------------------------------------------------------------------------
     def _calling(self, call: Callable[[], T]) -> T:
-        """Call a function of the drives and return its result; again if the envelope reports what the job knows."""
+        """Call a function of the drives; repeat it once if the envelope reports a stop that the job already knows."""
         try:
             return call()
         except SafetyError:
@@ -205,7 +205,7 @@ class SharedDrives(DrivesProxy):
         rows = {name: np.asarray(values) for name, values in (play or {}).items()}
         if cycles == 0 or every == 0 or any(one.ndim == 0 or len(one) != cycles for one in rows.values()):
             with self.lock:
-                return self._drives.record(asked, duration, play, period)  # which knows what is wrong
+                return self._drives.record(asked, duration, play, period)  # the drives report what is wrong
         piece = max(1, round(longest / cycle) // every) * every
         parts = []
         for first in range(0, cycles, piece):
@@ -223,7 +223,7 @@ class SharedDrives(DrivesProxy):
         play: Mapping[Any, ArrayLike] | None,
         period: float,
     ) -> Trace:
-        """Let a piece of time pass, with as many of the recorder's objects as can be sampled besides."""
+        """Let a piece of time pass, and sample as many of the recorder's objects as possible."""
         wanted = self._recorder.objects
         while (chosen := (*asked, *wanted)) in self._refused and wanted:
             wanted = wanted[:-1]
@@ -236,7 +236,7 @@ class SharedDrives(DrivesProxy):
             except ObjectAccessError:
                 if not wanted:
                     raise
-                # More than fits into the process data of a bus, or what cannot be sampled: found before time passes.
+                # Too many for the process data of a bus, or one that cannot be sampled: detected before time passes.
                 self._refused.add(chosen)  # type: ignore[arg-type]
                 wanted = wanted[:-1]
                 chosen = (*asked, *wanted)
@@ -245,7 +245,7 @@ class SharedDrives(DrivesProxy):
         return trace
 
     def _begin(self) -> float:
-        """Return when the time that passes now begins [s]: right after the last piece, unless there was a gap."""
+        """Return the beginning of the present piece of time [s]: the end of the last one, unless there was a gap."""
         before = self._recorder.now
         if self._drives.time_waits:
             return before
@@ -253,7 +253,7 @@ class SharedDrives(DrivesProxy):
         return before if abs(now - before) < SEAMLESS else max(now, before)
 
     def _keep_pace(self, span: float) -> None:
-        """Wait until real time has passed, too, where that of the drives does not by itself."""
+        """Wait for real time if emulated time is ahead of it."""
         now = time.perf_counter()
         if not self._drives.time_waits or not self.paced:
             self._due = now

@@ -1,4 +1,4 @@
-"""The state machine of CiA 402 as a picture: the present state is lit, and transitions can be pressed."""
+"""Draws the state machine of CiA 402: the present state is lit, and transitions can be pressed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ BOX = (168, 42)
 
 
 class DiagramPlace(NamedTuple):
-    """Where a state stands: the middle of its box."""
+    """The position of a state: the centre of its box."""
 
     x: int
     y: int
@@ -20,7 +20,7 @@ class DiagramPlace(NamedTuple):
 
 
 class Arrow(NamedTuple):
-    """A transition: its numbers in the standard, from and to, its controlword (None: the drive's own), its path."""
+    """A transition: its numbers in the standard, from and to, controlword (None: made by the drive itself), path."""
 
     numbers: str
     start: State | None
@@ -65,7 +65,7 @@ ARROWS = (
 
 
 def diagram(state: State | None) -> str:
-    """Return the picture with a state lit."""
+    """Return the SVG with a state lit."""
     arrows = "".join(_arrow(arrow, state) for arrow in ARROWS)
     boxes = "".join(_box(one, place, one is state) for one, place in PLACES.items())
     marker = (
@@ -89,7 +89,7 @@ def _box(state: State, place: DiagramPlace, is_lit: bool) -> str:
 
 
 def _arrow(arrow: Arrow, state: State | None) -> str:
-    """Return an arrow; one that leaves the present state by a command can be pressed."""
+    """Draw an arrow; it can be pressed if it leaves the present state by a command."""
     can = arrow.word is not None and arrow.start is state
     x, y = arrow.label
     sideways = "start" if x in (148, 454) else "end" if x in (72, 96) else "middle"

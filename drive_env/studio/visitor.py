@@ -1,4 +1,4 @@
-"""A visitor: one browser page that is open, with the axis that it looks at, and its way to hand in jobs."""
+"""A visitor: one open browser page with the axis that it shows, and its interface for jobs."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ class Visitor:
 
     Args:
         session: The drives.
-        client: NiceGUI's side of it.
-        axis: The axis that it looks at.
+        client: NiceGUI's client of the page.
+        axis: Number of the axis that it shows.
 
     Attributes:
-        jog_speed: Of its axis.
-        group: Axes that it commands together; all before any is left out.
-        group_speed: Of their jog.
+        jog_speed: Jog speed of its axis.
+        group: Axes that it commands together; all by default.
+        group_speed: Jog speed of the group.
     """
 
     def __init__(self, session: Session, client: Client, axis: int) -> None:
@@ -43,7 +43,7 @@ class Visitor:
 
     @staticmethod
     def named(axes: Sequence[int]) -> str:
-        """Return axes in words: "axis 0", "axes 0, 1"."""
+        """Return axes as text: "axis 0", "axes 0, 1"."""
         return f"ax{'i' if len(axes) == 1 else 'e'}s {', '.join(map(str, axes))}"
 
     @property
@@ -58,11 +58,11 @@ class Visitor:
         return axes[self.axis] if self.axis < len(axes) else None
 
     def set(self, **changes: Any) -> None:
-        """Keep settings of its axis, named as in `AxisSettings`, for the pages after this one."""
+        """Store settings of its axis, named as in `AxisSettings`, for later pages."""
         self.keep(lambda: self.session.workspace.change(self.axis, **changes))
 
     def keep(self, change: Callable[[], None]) -> None:
-        """Change the workspace; the page says where its file cannot be written."""
+        """Change the workspace; the page shows an error if its file cannot be written."""
         try:
             change()
         except OSError as error:
@@ -80,7 +80,7 @@ class Visitor:
             return None
 
     def hand_in(self, function: Callable[[Drives], T], title: str) -> None:
-        """Have a job run without waiting for it; the page shows it if it fails. Any thread may call it."""
+        """Run a job without waiting for it; the page shows its error. Any thread may call it."""
 
         def tell(done: Future[T]) -> None:
             if not done.cancelled() and (error := done.exception()) is not None and core.loop is not None:

@@ -1,4 +1,4 @@
-"""What people have set on the pages and find again, in a file, too: scope and jog speed of axes, units, favourites."""
+"""The users' settings on the pages, optionally stored in a file: scope and jog speed of axes, units, favourites."""
 
 from __future__ import annotations
 
@@ -20,25 +20,25 @@ from mechanics.reading.untrusted import read_toml
 
 FORMAT = 1
 CHANNELS = (cia402.POSITION_ACTUAL, cia402.VELOCITY_ACTUAL, cia402.TORQUE_ACTUAL)
-OF_VL = (cia402.VL_VELOCITY_DEMAND, cia402.VL_VELOCITY_ACTUAL)  # of a drive that has none of them
-# Of each dimension the units that can be chosen; the others have the usual one.
+OF_VL = (cia402.VL_VELOCITY_DEMAND, cia402.VL_VELOCITY_ACTUAL)  # for drives without any of `CHANNELS`
+# Units that can be chosen, by dimension; other dimensions have their usual unit.
 CHOICES = {"angle": ("rev", "deg", "rad"), "speed": ("rpm", "rev/s", "rad/s", "deg/s"), "current": ("A", "mA")}
 UNITS_TEXT = "; ".join(f"{dimension}: {', '.join(units)}" for dimension, units in CHOICES.items())
 
 
 @dataclass(frozen=True)
 class AxisSettings:
-    """What is set for an axis.
+    """The settings of an axis.
 
     Attributes:
-        jog_speed: As it was typed.
+        jog_speed: As typed.
         channels: Objects on the scope.
-        window: Time across the picture [s].
+        window: Duration of a recording [s].
         mode: A name of `scope_view.MODES`.
         edge: A name of `scope_trigger.EDGES`.
-        source: The object whose edge is meant.
-        level: As it was typed, with its unit.
-        before: Share of the picture before the trigger.
+        source: Object of an edge.
+        level: As typed, with its unit.
+        before: Share of the recording before the trigger.
     """
 
     jog_speed: str = "60 rpm"
@@ -52,20 +52,20 @@ class AxisSettings:
 
 
 class Workspace:
-    """The settings of each axis, and those of all axes.
+    """The settings of each axis, and those common to all axes.
 
     Args:
-        description: Of the device.
-        file: TOML that has them, and gets what is changed; None keeps them as long as the studio runs. A file that does
-            not exist yet is written with the first change.
+        description: Description of the device.
+        file: TOML file from which they are read and to which changes are written; None keeps them only while the studio
+            runs. A missing file is created with the first change.
 
     Raises:
         ValueError: For a file that is not a workspace of this device.
         OSError: If it cannot be read.
 
     Attributes:
-        units: In which values of each dimension are shown.
-        favourites: Objects that the page Dictionary shows among them.
+        units: Displayed unit of each dimension.
+        favourites: Objects that the page Dictionary lists as favourites.
     """
 
     def __init__(self, description: Description, file: Path | None = None) -> None:
@@ -84,7 +84,7 @@ class Workspace:
 
     @property
     def usual_channels(self) -> tuple[Key, ...]:
-        """The objects on a scope where nothing else is set: position, velocity and current, or what a drive has."""
+        """The default objects of a scope: position, velocity and current, or those that a drive has."""
         there = [(index, 0) for index in (*CHANNELS, *OF_VL) if self._description.has((index, 0))]
         return tuple(key for key in there if key[0] in CHANNELS) or tuple(there)
 
@@ -102,12 +102,12 @@ class Workspace:
         self._save()
 
     def show_in(self, dimension: str, unit: str) -> None:
-        """Show values of a dimension in a unit from now on; errors as `change`."""
+        """Set the displayed unit of a dimension; errors as in `change`."""
         self.units |= _units({dimension: unit})
         self._save()
 
     def toggle_favourite(self, key: Key) -> None:
-        """Add an object to the favourites, or take it away; errors as `change`."""
+        """Add an object to the favourites, or remove it; errors as in `change`."""
         kept = tuple(one for one in self.favourites if one != key)
         self.favourites = kept if key in self.favourites else (*kept, key)
         self._save()
@@ -128,18 +128,18 @@ class Workspace:
 
 
 def object_name(key: Key) -> str:
-    """Return an object as the pages and the file name it: 606C:00."""
+    """Format an object as on the pages and in the file: 606C:00."""
     return f"{key[0]:04X}:{key[1]:02X}"
 
 
 def object_key(name: str) -> Key:
-    """Return the object of a name; ValueError for what is not one."""
+    """Parse the name of an object; ValueError if it is invalid."""
     index, _, sub = name.partition(":")
     return int(index, 16), int(sub, 16)
 
 
 def _written(value: Any) -> Any:
-    """Return a setting as the file has it."""
+    """Convert a setting to its form in the file."""
     if not isinstance(value, tuple):
         return value
     return object_name(value) if value and isinstance(value[0], int) else [object_name(key) for key in value]
@@ -166,7 +166,7 @@ def _line_named(file: Path) -> Iterator[None]:
 
 
 def _units(table: Mapping[str, str]) -> dict[str, str]:
-    """Return the unit of each dimension; ValueError for one that cannot be chosen."""
+    """Check the unit of each dimension; ValueError for one that cannot be chosen."""
     for dimension, unit in table.items():
         if unit not in CHOICES.get(dimension, ()):
             raise ValueError(f"units: {dimension} = {unit!r} is not one of {UNITS_TEXT}")
@@ -203,12 +203,12 @@ def _settings(table: Mapping[str, Any], description: Description) -> AxisSetting
 
 
 def trigger_of(settings: AxisSettings, axis: int, level: float) -> ScopeTrigger:
-    """Return the trigger that is set; a change of state and a fault look at the statusword.
+    """Return the trigger in the settings; a change of state and a fault use the statusword.
 
     Args:
-        settings: Of the axis.
-        axis: The axis.
-        level: Of an edge, as the integer that the wire carries.
+        settings: Settings of the axis.
+        axis: Number of the axis.
+        level: Raw level of an edge.
     """
     has_level = settings.edge in ("rising", "falling")
     return ScopeTrigger(settings.edge, axis, settings.source if has_level else (cia402.STATUSWORD, 0), level)

@@ -1,1 +1,1 @@
-"""Moves and trials, and their scores: environments and tuning stand on these."""
+"""Moves, trials and their scores, used by environments and tuning."""

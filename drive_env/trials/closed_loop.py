@@ -1,8 +1,8 @@
-"""One trial of the gains of a stepper's closed loop: a ramp that overloads the motor, and how it is caught up with.
+"""One trial of the gains of a stepper's closed loop: a ramp that overloads the motor, and how the axis catches up.
 
-Within the motor's torque the corrections of a closed loop do nothing. So the ramp of the trial asks for more than the
-run current gives: the axis falls behind by `BEHIND` full steps, and the corrections take it back to the demand. A light
-load is overloaded by a smaller run current, for the trial alone. What is seen is what a master sees: encoder, demand,
+Within the motor's torque the corrections of a closed loop have no effect. So the ramp of the trial asks for more than
+the run current gives: the axis falls behind by `BEHIND` full steps, and the corrections bring it back to the demand. A
+light load is overloaded by a smaller run current during the trial. Only signals of a master are used: encoder, demand,
 and 6077h, which is the torque current once the encoder commutates.
 """
 
@@ -30,23 +30,23 @@ from drive_env.trials.positioning import CYCLE, PROFILE, TRAVEL_SHARE, TRIAL, Mo
 from drive_env.trials.score import Terms, cost
 from mechanics.arrays import Floats, Integers, Mask
 
-BEHIND = 3.0  # full steps, by which the ramp leaves the axis behind; up to one the field holds it
-OVERLOAD = 4.0  # acceleration of the ramp over what the run current of the trial gives
-FAST = 1.5  # speed of the ramp over the rated one, up to which the supply carries the rated current
+BEHIND = 3.0  # full steps by which the axis falls behind the ramp; up to one the field holds it
+OVERLOAD = 4.0  # acceleration of the ramp over that which the trial's run current gives
+FAST = 1.5  # speed of the ramp over the rated one, up to which the supply can drive the rated current
 _LEFT = 1.0 - 1.0 / OVERLOAD
-LEAST_SHARE = 0.3  # of the rated current: with less the detent torque decides
-FRICTION_SHARE = 0.5  # of the trial's torque, that friction and a constant load take at most
-PROBE = 0.8  # run current of the probe over that of the trial: a greater overload
-CLOSING, LONGEST_CLOSING = 0.6, 3.2  # s: the rotor swings in for 0.4 s, and for 3 s at most
-LOOK = 0.05  # s
-SWINGING = 2.0  # times the change of the current in the rotor's own swing: what changes more oscillates
+LEAST_SHARE = 0.3  # of the rated current: with less the detent torque dominates
+FRICTION_SHARE = 0.5  # of the trial's torque: greatest share of friction and constant load
+PROBE = 0.8  # run current of the probe over that of the trial: increases the overload
+CLOSING, LONGEST_CLOSING = 0.6, 3.2  # s: the rotor settles in 0.4 s, at most 3 s
+LOOK = 0.05  # s between two checks
+SWINGING = 2.0  # times the change of the current by the rotor's own swing: a larger one is an oscillation of the loop
 
 
 def swing_change(motor: Motor, inertia: Floats, current: Floats) -> Floats:
-    """Return by how much the torque current changes in a ms [A, RMS] while a rotor swings by all of it, (num_axes,).
+    """Return the change of the torque current per ms [A, RMS] during the largest swing of a rotor, (num_axes,).
 
-    An overload that has been caught up with leaves the rotor swinging in its field at sqrt(n_p T / J), with the torque
-    current from limit to limit until the swing has died away: that is no oscillation of the loop.
+    After an overload the rotor swings in its field at sqrt(n_p T / J), and the torque current goes from limit to limit
+    until the swing has decayed: this is no oscillation of the loop.
 
     Args:
         motor: The motor.
@@ -58,16 +58,16 @@ def swing_change(motor: Motor, inertia: Floats, current: Floats) -> Floats:
 
 
 class ClosedLoopTrial(NamedTuple):
-    """The result of a trial, as `gain_trial.Trial` has it."""
+    """The result of a trial, with the interface of `gain_trial.Trial`."""
 
-    terms: Terms  # its disturbance is (1 + b/t_0): b is how long the axis is behind its demand
+    terms: Terms  # its disturbance is (1 + b/t_0), with the time b by which the axis is behind its demand
     following: Floats
     aborted: Mask
     error: Floats
     culprit: Mask
 
     def costs(self, softness: Floats) -> Floats:
-        """Return J by measured terms of every phase, (phases, num_axes); E_d/E_0 is times `softness`."""
+        """Return J by measured terms of every phase, (phases, num_axes); `softness` is a factor of E_d/E_0."""
         return cost(self.terms._replace(disturbance=self.terms.disturbance * softness, tripped=self.aborted))
 
 
@@ -77,33 +77,33 @@ def full_step(motor: Motor) -> float:
 
 
 def held_in_trial(device: Device, motor: Motor, share: Floats) -> Floats:
-    """Return the torque [N m] that a share of the rated run current holds, (num_axes,)."""
+    """Return the torque [N m] that a share of the rated run current can hold, (num_axes,)."""
     return holding_torque(motor, share * float(amplitude(device, rated_setting(device, motor))))
 
 
 def trial_share(device: Device, motor: Motor, found: Identified) -> Floats:
-    """Return the share of the rated run current with which a ramp leaves the axes behind by `BEHIND`, (num_axes,)."""
+    """Return the share of the rated run current with which the axes fall behind a ramp by `BEHIND`, (num_axes,)."""
     speed = FAST * motor.rated_speed
     torque = found.inertia * speed**2 * _LEFT / (2.0 * BEHIND * full_step(motor))
     taken = motor.torque_constant * (found.coulomb + np.abs(found.offset) + found.viscous * speed)
-    # As in `phase_current.current_for`: iron saturates.
+    # Saturation of the iron, as in `phase_current.current_for`.
     needed = np.maximum(torque, taken / FRICTION_SHARE) / motor.torque_constant
     current = needed / np.sqrt(np.maximum(1.0 - motor.saturation * needed**2, 1e-6))
     return np.clip(current / float(amplitude(device, rated_setting(device, motor))), LEAST_SHARE, 1.0)
 
 
 def plan_overload(device: Device, motor: Motor, found: Identified, scaler: ArrayLike, reach: ArrayLike) -> Move:
-    """Return a move of 60 ms whose ramp asks for `OVERLOAD` times the torque of the trial's run current.
+    """Plan a move of 60 ms whose ramp asks for `OVERLOAD` times the torque of the trial's run current.
 
-    While the motor reaches the ramp's speed v with the torque T it falls behind by J v^2 (1 - 1/r) / 2 T, r the
-    overload: a heavy load has a slower ramp.
+    Until the motor reaches the ramp's speed v with torque T, it falls behind by J v^2 (1 - 1/r) / 2 T, with the
+    overload r: a heavy load gets a slower ramp.
 
     Args:
         device: The drive.
         motor: The motor.
-        found: What was identified, (num_axes,).
+        found: The identified axes, (num_axes,).
         scaler: Increments per revolution.
-        reach: How far the rotor may go, with its sign [rad].
+        reach: Signed angle that the rotor may turn [rad].
     """
     to, time = np.asarray(reach, float), PROFILE * CYCLE
     share = trial_share(device, motor, found)
@@ -127,13 +127,13 @@ def plan_overload(device: Device, motor: Motor, found: Identified, scaler: Array
 
 
 class ClosedLoopTrials(OpenLoopTrials):
-    """Runs trials on steppers whose loop is closed, as `Trials` does on servo drives.
+    """Runs trials on steppers with closed loop, as `Trials` does on servo drives.
 
-    The machine is identified with the loop open; it is closed then, and is what it was after `leave`.
+    The machine is identified with open loop; then the loop is closed, until `leave` restores it.
     """
 
     STATE = (*OpenLoopTrials.STATE, "_closes", "_inertia")
-    computes_demand = False  # how far an axis is behind is what is seen of its loop
+    computes_demand = False  # the lag behind the demand is what shows the loop, so the demand must be recorded
 
     def __init__(self, drives: Drives, motor: Motor, axes: int, t_0: float, closed: ClosedLoop) -> None:
         super().__init__(drives, motor, axes, t_0)
@@ -142,20 +142,20 @@ class ClosedLoopTrials(OpenLoopTrials):
         self._inertia = np.full(self._closes.shape, np.inf)
 
     def recover(self, where: Mask) -> None:
-        """Bring axes to pp, enabled, and close the loops of those that have been identified."""
+        """Bring axes to pp, enabled, and close the loops of identified ones."""
         super().recover(where)
         self._watch_no_window()
         self._close(where & self._closes, LONGEST_CLOSING)
 
     def power_up(self, where: Mask) -> None:
-        """Do so with drives that were switched on just now, in as many milliseconds whatever becomes of them."""
+        """Enable newly switched-on drives in pp, and close loops, in a fixed number of milliseconds."""
         super().power_up(where)
         if self._closes.any():
             self._drives.write(Role.LOOP_MODE, self._closed.mode, where=where & self._closes)
             self._drives.advance(CLOSING)
 
     def identify(self, reach: Floats, where: Mask) -> tuple[Identified, Integers]:
-        """Identify with the loop open; close it."""
+        """Identify with open loop, and mark the loops to be closed."""
         drives = self._drives
         self._closes &= ~where
         drives.write(Role.LOOP_MODE, OPEN, where=where)
@@ -166,7 +166,7 @@ class ClosedLoopTrials(OpenLoopTrials):
         return found, origin
 
     def go(self, target: Integers, where: Mask) -> None:
-        """Set off for a position of the encoder, which is the axis' own in a closed loop."""
+        """Start a move to a position of the encoder, which is the drive's own with closed loop."""
         closed = where & self._closes
         if closed.any():
             Trials.go(self, target, closed)
@@ -176,7 +176,7 @@ class ClosedLoopTrials(OpenLoopTrials):
     def run(  # type: ignore[override]
         self, gains: Integers, incumbent: Integers, move: Move, origin: Integers, direction: Integers, where: Mask
     ) -> ClosedLoopTrial:
-        """Try gains in a move from the origin, back, and there again with less current; as `Trials.run` has it."""
+        """Try gains in a move from the origin, back, and there again with less current; otherwise as `Trials.run`."""
         drives, count = self._drives, self._drives.num_axes
         away = origin + direction * move.distance
         shape = (len(PHASES), count)
@@ -204,7 +204,7 @@ class ClosedLoopTrials(OpenLoopTrials):
         return ClosedLoopTrial(terms, np.maximum(following, 0.5 * CYCLE), aborted, first_error, culprit)
 
     def _tried(self, gains: Integers, move: Move, *, is_probe: bool) -> Integers:
-        """Return gains as a phase of the trial has them."""
+        """Return the gains of a phase of the trial: with the trial's or the probe's run current."""
         return with_run_current(device_of(self._drives), gains, (PROBE if is_probe else 1.0) * move.share)
 
     def _terms(
@@ -215,7 +215,7 @@ class ClosedLoopTrials(OpenLoopTrials):
         return move_terms(position, ampere, move, self._t_0, self._motor.rated_current, target, sign)
 
     def _shaking(self, trace: Mapping[Any, Integers]) -> Mask:
-        """Return whose current changes more from ms to ms than that of a loop may, and of a rotor that swings."""
+        """Return which axes' currents change more from ms to ms than those of a stable loop and a swinging rotor."""
         change = np.diff(trace[cia402.TORQUE_ACTUAL] * ampere_per_count(self._drives), axis=0)
         run, _ = run_and_standby(device_of(self._drives), read_gains(self._drives))
         most = np.maximum(
@@ -228,7 +228,7 @@ class ClosedLoopTrials(OpenLoopTrials):
         return np.maximum(np.abs(move.distance), 1).astype(float)
 
     def _close(self, where: Mask, longest: float) -> None:
-        """Close loops that are open, and wait until they commutate; one that does not is stopped in its trial."""
+        """Close open loops and wait until the encoder commutates; the trial stops an axis whose loop stays open."""
         drives = self._drives
         if not np.any(opened := where & ~self._is_closed()):
             return
@@ -239,7 +239,7 @@ class ClosedLoopTrials(OpenLoopTrials):
                 break
 
     def _is_closed(self) -> Mask:
-        """Return whose loop is closed: of load angle control, once the encoder commutates."""
+        """Return which loops are closed; load angle control also needs the encoder to commutate."""
         drives = self._drives
         asked = drives.read(Role.LOOP_MODE) == self._closed.mode
         return np.asarray(asked & (self._closed.is_pid | (drives.read(Role.LOOP_INITIALISED) != 0)))

@@ -1,8 +1,8 @@
 """The robust cost of the gains of a stepper's closed loop on emulated machines: a trial's move, and an overload.
 
-In place of a servo's load step, which the field holds by itself, the axis gets `PUSH` times the torque that the trial's
-run current holds, for as long as takes it away by `AWAY` full steps. E_d is the integral of its error from there on.
-The variant of the gains is a run current of 0.8 times, as in open loop.
+Instead of a servo's load step, which the field would hold by itself, the axis gets `PUSH` times the torque that the
+trial's run current holds, until it has moved by `AWAY` full steps. E_d is the integral of its error from then on. The
+variant of the gains has 0.8 times the run current, as in open loop.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ from drive_env.trials.positioning import CYCLE, SETTLED, TRIAL, Move, power_up
 from drive_env.trials.score import LOAD_SHARE, StepperScore
 from mechanics.arrays import Floats, Integers, Mask
 
-PUSH = 1.3  # torque over what the trial's run current holds
+PUSH = 1.3  # torque over that which the trial's run current holds
 AWAY = 4.0  # full steps
 LONGEST_PUSH = 30  # ms
 
 
 class ClosedLoopScore(StepperScore):
-    """As `RobustScore`, of steppers whose loop is closed."""
+    """`RobustScore` for steppers with closed loop."""
 
     def set_moves(self, move: Move, where: Mask | None = None) -> None:
-        """Take the move of every axis, and the share of the run current that belongs to it."""
+        """Set the move of every axis, with its share of the run current."""
         lanes = np.ones(self.num_machines, bool) if where is None else where
         before = np.broadcast_to(self._move.share, self._drives.num_axes)
         super().set_moves(move, where)
@@ -40,11 +40,11 @@ class ClosedLoopScore(StepperScore):
         self._move = self._move._replace(share=np.where(each, share, before))
 
     def _pushes(self) -> tuple[Floats, Integers]:
-        """Return the torque of every machine [N m], signed as `machine.load_torque`, and for how many ms it acts."""
+        """Return the torque of every machine [N m], with the sign of `machine.load_torque`, and its duration [ms]."""
         drives, move = self._drives, self._move
         motor = drives.motor
         held = held_in_trial(drives.device, motor, np.asarray(move.share, float))
-        # The plan of the move tells the inertia: it asks for so many times the torque that is there.
+        # The inertia follows from the move, which was planned for `OVERLOAD` times the available torque.
         inertia = OVERLOAD * held * move.increments / np.maximum(move.acceleration, 1)
         time = np.sqrt(2.0 * AWAY * full_step(motor) * inertia / ((PUSH - 1.0) * held))
         machines = (self.num_machines * self._runs, self._axes[2])
@@ -56,7 +56,7 @@ class ClosedLoopScore(StepperScore):
         return with_run_current(self._drives.device, gains, self._factors * np.asarray(self._move.share, float))
 
     def _get_ready(self) -> tuple[Integers, Mask]:
-        """Enable the drives at rest and close their loops; return where they go, and of which axes none is closed."""
+        """Enable the drives at rest and close their loops; return targets [inc], and axes whose loop stayed open."""
         drives = self._drives
         closed = drives.device.gains.loop_of_kind(LOAD_ANGLE)
         assert closed is not None, "a drive that closes such a loop"
@@ -69,7 +69,7 @@ class ClosedLoopScore(StepperScore):
         return drives.read(cia402.POSITION_ACTUAL) + self._move.distance, is_open
 
     def _load_step(self, objects: list[ObjectName]) -> Mapping[Any, Integers]:
-        """Record the axes while they are pushed away and come back."""
+        """Record the axes while they are pushed away and return."""
         drives, pushed = self._drives, []
         torque, lasts = self._pushes()
         for k in range(LONGEST_PUSH):

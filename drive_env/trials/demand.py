@@ -1,7 +1,7 @@
-"""The position demand of a move in pp: as the drive has it, or computed from the profile written to it.
+"""The position demand of a move in pp: read from the drive, or computed from the profile written to it.
 
-Some drives have no 6062h among their process data. Their demand is computed then, from the profile that was written. It
-is that of the drive to about a millisecond: the moment at which a set-point written by SDO takes effect is not known.
+Drives without 6062h in their process data get a demand computed from the written profile. It equals the drive's to
+about a millisecond, since the time at which a set-point written by SDO takes effect is unknown.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ COMPUTED = (
 
 
 def is_recorded(drives: Drives) -> bool:
-    """Return whether drives can record their position demand."""
+    """Return whether the drives can record their position demand."""
     return drives.bus is None or drives.bus.can_record([cia402.POSITION_DEMAND])
 
 
@@ -28,10 +28,10 @@ def computed(begin: Integers, target: Integers, move: Move, cycles: int) -> Floa
     """Return the demand of the profile of a move from rest to rest [inc], shape (cycles, num_axes).
 
     Args:
-        begin: Where it begins [inc], (num_axes,).
-        target: Where it ends [inc], (num_axes,).
+        begin: First position [inc], (num_axes,).
+        target: Last position [inc], (num_axes,).
         move: Its velocity and acceleration.
-        cycles: How many, the first when it begins.
+        cycles: Number of cycles, the first at the beginning.
     """
     way = np.asarray(target, float) - begin
     distance = np.abs(way)

@@ -1,6 +1,6 @@
-"""One trial of gains on drives: a positioning move, the reversal, and the gain probe; and identification before it.
+"""One trial of gains on drives: a positioning move, the reversal, and the gain probe; and the identification before.
 
-All of it can be done and seen on a real drive: position, its demand, current and statusword once a millisecond.
+All of it is possible on a real drive: it uses position, position demand, current and statusword once a millisecond.
 """
 
 from __future__ import annotations
@@ -41,33 +41,33 @@ from mechanics.arrays import Floats, Integers, Mask
 
 PHASES = ("move", "reversal", "probe")
 PROBE = 1.5  # velocity P of the probe over that of the trial
-PHASE_TITLES = "move", "reversal", f"move with {PROBE:g} times velocity P"  # as messages name them
+PHASE_TITLES = "move", "reversal", f"move with {PROBE:g} times velocity P"  # in messages
 
-# The watch looks every 25 ms at what has passed since its last look: what oscillates is stopped within 50 ms.
+# The watch checks every 25 ms the samples since its last check: an oscillation is stopped within 50 ms.
 RECOVERY, RECOVERY_TIME = 5, 0.01  # attempts, and the time between them [s]
 STANDSTILL = 1.0  # rad/s, one count in 1.5 ms: below it the sign of a speed is noise
-LAG = 3  # ms by which a filtered speed may lag behind its rotor: a move has begun, or goes on, so long beside it
+LAG = 3  # ms by which a filtered speed may lag behind its rotor: added around each motion
 
 
 class Identified(NamedTuple):
-    """Properties of a machine by the drive's own signals, each of shape (num_axes,).
+    """Identified properties of a machine, each of shape (num_axes,).
 
-    Inertia is measured over the torque constant, and given with that of the data sheet.
+    Inertia is measured relative to the torque constant, and given with the data sheet's.
     """
 
     inertia: Floats  # kg*m^2, rotor and load
     coulomb: Floats  # A, dry friction
     viscous: Floats  # A*s/rad
-    offset: Floats  # A, what gravity or a constant load takes
+    offset: Floats  # A, current of gravity or a constant load
 
 
 class Trial(NamedTuple):
-    """The result of a trial; `terms` and `aborted` are (phases, num_axes), `following` [s] too.
+    """The result of a trial; `terms`, `aborted` and `following` [s] have shape (phases, num_axes).
 
-    following: integral of |demand - actual| dt over the whole of a phase, over the move's size.
-    error: demand less actual of the move over its size, shape (TRIAL, num_axes).
-    culprit: Axes that oscillated or went into fault themselves when their machine was stopped, (num_axes,): others of
-    the machine are stopped with them.
+    following: Integral of |demand - actual| dt over a whole phase, over the move's size.
+    error: Demand less actual during the move, over its size, shape (TRIAL, num_axes).
+    culprit: Axes that oscillated or went into fault themselves, (num_axes,); the other axes of their machine were
+        stopped with them.
     """
 
     terms: Terms  # its disturbance is 1
@@ -80,7 +80,7 @@ class Trial(NamedTuple):
         """Return J by measured terms of every phase, (phases, num_axes).
 
         Args:
-            softness: `softness` of the trial's gains over that of the rule's, (num_axes,), for E_d/E_0.
+            softness: `softness` of the trial's gains over that of the rule's, (num_axes,), as a factor of E_d/E_0.
         """
         disturbance = np.stack([softness, softness, softness / PROBE])
         return cost(self.terms._replace(disturbance=disturbance, tripped=self.aborted))
@@ -89,31 +89,31 @@ class Trial(NamedTuple):
 def softness(known: GainSet, gains: Integers) -> Floats:
     """Return a number proportional to the integral of the error after a load step, (num_axes,).
 
-    No load step exists on a bus; but the integrators of a P-PI cascade leave it no choice: for a current i that the
-    load takes, the integral of the position error is i T_i / (P k_v), as long as the error keeps its sign.
+    Load steps are impossible on a bus; but the integrators of a P-PI cascade determine the result: if the load takes a
+    current i, the integral of the position error is i T_i / (P k_v), as long as the error keeps its sign.
     """
     cascade = known.columns_of("velocity", "position")
     return np.asarray(1.0 / known.strength(gains, cascade).prod(axis=1))
 
 
 def measured_cost(costs: Floats) -> Floats:
-    """Return the cost of a trial: half the mean of move and reversal, half the worst phase, as in the robust cost."""
+    """Return the cost of a trial, as in the robust cost: half the mean of move and reversal, half the worst phase."""
     return np.asarray(0.5 * costs[:2].mean(axis=0) + 0.5 * costs.max(axis=0))
 
 
 class Trials(Saved):
-    """Runs trials on drives; the axes of a machine are stopped together.
+    """Runs trials on drives; all axes of a machine are stopped together.
 
     Args:
         drives: The drives, in pp.
-        motor: What turns them.
-        axes: Axes of a machine.
+        motor: Motor of the axes.
+        axes: Number of axes of a machine.
         t_0: Four times the sum of the small time constants [s].
 
     Attributes:
         look: If not None, called after every cycle.
-        computes_demand: Where drives do not send their demand, that of the profile does.
-        returns: Whether a trial ends where it began; else where its move did.
+        computes_demand: Whether a demand that the drives cannot send is replaced by that of the profile.
+        returns: Whether a trial ends where it began; otherwise it ends where its move did.
     """
 
     computes_demand = True
@@ -127,10 +127,10 @@ class Trials(Saved):
         self._t_0 = t_0
 
     def identify(self, reach: Floats, where: Mask) -> tuple[Identified, Integers]:
-        """Move there and back with the present gains; return the identified axes, and where they began [inc].
+        """Move there and back with the present gains; return the identified axes, and their first positions [inc].
 
         Args:
-            reach: How far the rotors may turn from here, with the sign [rad], shape (num_axes,).
+            reach: Signed angles that the rotors may turn from here [rad], shape (num_axes,).
             where: Axes that move.
         """
         drives = self._drives
@@ -161,16 +161,16 @@ class Trials(Saved):
     ) -> Trial:
         """Try gains, raw integers of shape (num_axes, count), in a move from the origin [inc], back, and there again.
 
-        Where an axis oscillates or goes into fault, its machine gets the incumbent back at once, its fault is reset,
-        and it continues with it.
+        If an axis oscillates or goes into fault, its machine immediately gets the incumbent gains back, its fault is
+        reset, and it continues with these gains.
 
         Args:
-            gains: What is tried.
-            incumbent: What an axis goes on with that is stopped.
+            gains: Gains to try.
+            incumbent: Gains for stopped axes.
             move: The move.
-            origin: Where the axes are [inc].
-            direction: 1 to move as planned, -1 the other way, shape (num_axes,).
-            where: Axes that take part; the others' figures mean nothing.
+            origin: Present positions of the axes [inc].
+            direction: 1 to move as planned, -1 in the other direction, shape (num_axes,).
+            where: Axes that take part; results of the others are meaningless.
         """
         drives = self._drives
         away = origin + direction * move.distance
@@ -203,7 +203,7 @@ class Trials(Saved):
         return Trial(terms, following, aborted, first_error, culprit)
 
     def recover(self, where: Mask) -> None:
-        """Bring axes to pp, enabled, whatever state they are in, within 50 ms; one that cannot stays as it is."""
+        """Bring axes in any state to pp, enabled, within 50 ms; an axis that cannot be enabled stays as it is."""
         drives = self._drives
         motion.select_mode(drives, "pp", where)
         for _ in range(RECOVERY):
@@ -214,15 +214,15 @@ class Trials(Saved):
             drives.advance(RECOVERY_TIME)
 
     def power_up(self, where: Mask) -> None:
-        """Take drives that were just switched on to pp, enabled, in as many milliseconds whatever becomes of them."""
+        """Enable newly switched-on drives in pp, in a fixed number of milliseconds."""
         power_up(self._drives, where)
 
     def go(self, target: Integers, where: Mask) -> None:
-        """Set off for a position [inc]."""
+        """Start a move to a position [inc]."""
         start(self._drives, _on_the_counter(target), where)
 
     def leave(self) -> None:
-        """Put back all that trials have changed in the drives besides gains and profiles; the axes must be disabled."""
+        """Restore all settings except gains and profiles that trials have changed; the axes must be disabled."""
 
     def down(self) -> Mask:
         """Return which axes are not enabled."""
@@ -231,9 +231,9 @@ class Trials(Saved):
     def _phase(
         self, target: Integers, incumbent: Integers, stopped: Mask, where: Mask
     ) -> tuple[Floats, Floats | None, Floats, Mask, Mask]:
-        """Move; return position, demand, current, the machines stopped so far, and the axes that caused it now.
+        """Move; return position, demand, current, machines stopped so far, and axes that newly caused a stop.
 
-        The demand is None where the drives cannot send it.
+        The demand is None if the drives cannot send it.
         """
         drives, to = self._drives, _on_the_counter(target)
         objects = [cia402.POSITION_ACTUAL, cia402.TORQUE_ACTUAL, cia402.STATUSWORD]
@@ -263,17 +263,17 @@ class Trials(Saved):
         return seen[cia402.POSITION_ACTUAL], demand, seen[cia402.TORQUE_ACTUAL], stopped, culprit
 
     def _shaking(self, trace: Mapping[Any, Integers]) -> Mask:
-        """Return which axes oscillate in the samples of a look, (num_axes,)."""
+        """Return which axes oscillate in the samples of one check, (num_axes,)."""
         current = trace[cia402.TORQUE_ACTUAL] * ampere_per_count(self._drives)
         return np.asarray(shakes(current, self._motor.rated_current))
 
     def _prepare(self, objects: list[Any]) -> None:
-        """Have a bus map the objects of a recording: in real time the 10 ms for it would miss samples of a move."""
+        """Map the objects of a recording on a bus in advance: it takes 10 ms, which a move in real time cannot wait."""
         if not self._drives.time_waits:
             self._drives.record(objects, 0.0)
 
     def _record(self, objects: list[Any], cycles: int) -> Mapping[Any, Integers]:
-        """Let cycles pass, one by one where someone looks, and return the objects, (cycles, num_axes) each."""
+        """Record objects for some cycles, (cycles, num_axes) each; cycle by cycle if `look` is set."""
         if self.look is None:
             trace = self._drives.record(objects, cycles * CYCLE)
             return {name: trace[name] for name in objects}
@@ -288,22 +288,22 @@ class Trials(Saved):
 
 
 def clear(drives: Drives, where: Mask) -> None:
-    """Reset faults and enable again, without waiting; an axis that has not come to rest yet stays as it is."""
+    """Reset faults and enable again without waiting; an axis that still moves stays as it is."""
     for word in (cia402.DISABLE_VOLTAGE, cia402.FAULT_RESET, *cia402.ENABLING):
         drives.write(cia402.CONTROLWORD, word, where=where)
 
 
 def _on_the_counter(position: Integers) -> Integers:
-    """Return positions as 607Ah takes them: the counter wraps at 2^31."""
+    """Wrap positions at 2^31 for 607Ah."""
     return wrapped(position).astype(np.int64)
 
 
 def samples_in_motion(speed: Floats, around: int) -> Mask:
-    """Return which samples of speeds [rad/s] are of a rotor in motion, or within so many milliseconds of one that is.
+    """Return which samples of speeds [rad/s] belong to a moving rotor, or are within `around` samples of such.
 
     Args:
         speed: Shape (samples, num_axes).
-        around: In milliseconds.
+        around: Number of samples (ms).
     """
     fast = np.abs(speed) > STANDSTILL
     found = fast.copy()
@@ -323,12 +323,12 @@ def momentum_balance(
 ) -> Identified:
     """Fit i = (J domega/dt) / K_t + coulomb sign(omega) + viscous omega + offset, integrated once over time.
 
-    The integral has no derivative of a noisy speed, and an elastic load that swings has little momentum of its own. The
-    momentum is by the angle, and the impulse by trapezoids up to its samples: what lags, as a filtered speed does,
-    passes for friction on an axis that swings.
-    With an inertia that is known already [kg m^2], (num_axes,), the viscous friction is the motor's, and dry friction
-    alone is fitted: in a short move the two look alike. `moving`, as long as `speed`, tells the samples that count,
-    all by default: at rest dry friction holds what it likes up to its own, which is no constant load.
+    The integral avoids the derivative of a noisy speed, and an oscillating elastic load has little momentum of its own.
+    The momentum is computed from the angle, and the impulse by trapezoids up to its samples: a lag, as of a filtered
+    speed, would be mistaken for friction on an oscillating axis.
+    With a known inertia [kg m^2], (num_axes,), the viscous friction is the motor's, and only dry friction is fitted: in
+    a short move the two cannot be separated. `moving`, as long as `speed`, selects the samples that count, all by
+    default: at rest dry friction can hold any load up to its own value, which must not count as a constant load.
     """
     sign = np.clip(speed / STANDSTILL, -1.0, 1.0)
     rate = np.gradient(angle, CYCLE, axis=0)
@@ -349,10 +349,10 @@ def momentum_balance(
         columns[:, :, [0, 2]] = 0.0
     scale = np.maximum(np.sqrt(np.mean(columns**2, axis=1, keepdims=True)), 1e-12)
     X = columns / scale
-    # An axis that did not move says nothing; the small term keeps its equations solvable.
+    # An axis that did not move has no information; the small term keeps its equations solvable.
     normal = X.transpose(0, 2, 1) @ X + 1e-6 * samples * np.eye(X.shape[2])
     solved = np.linalg.solve(normal, X.transpose(0, 2, 1) @ impulse[:, :, None])[..., 0] / scale[:, 0]
-    # Of a machine that left physics nothing is known, and nothing moves with less than its rotor.
+    # Values of a machine that left the range of physics are unknown; the inertia is at least about the rotor's.
     solved = np.nan_to_num(solved)
     if inertia is None:
         inertia = solved[:, 0] * motor.torque_constant

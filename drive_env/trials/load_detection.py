@@ -1,13 +1,14 @@
-"""One trial of StallGuard threshold and CoolStep: moves at a working speed, without CoolStep, with it, and a probe.
+"""One trial of StallGuard threshold and CoolStep: moves at a working speed without CoolStep, with it, and a probe.
 
-What is wanted of them is no false stall of the axis' own load, a stall that is seen before steps are lost, and less
-current. The axis need not be pushed for it: the load reading is all but linear in cos d - sin d of the load angle d
-(`load_reading.py`), so that a move tells the angle at which it would fall to 0; and the torque being the same, the
-current that CoolStep leaves is to the other as the sines of their load angles. Stop on stall is off meanwhile.
+The aims are no false stall by the axis' own load, a stall detected before steps are lost, and less current. The axis
+need not be loaded for this: the load reading is nearly linear in cos d - sin d of the load angle d (`load_reading.py`),
+so that a move gives the angle at which it would fall to 0; and at equal torque, the currents with and without CoolStep
+are inversely proportional to the sines of their load angles. Stop on stall is off during the trial.
 
-J is that of the open loop. Its terms are here: settling and overshoot none; load angle, that with CoolStep; effort, the
-current that CoolStep leaves; in place of the vibration stands how far from `STALL_ANGLE` a stall would be seen. A
-trial counts as stopped where steps are lost, or where the axis' own load would be taken for a stall.
+J is that of the open loop with these terms: settling and overshoot are 1 and 0; load angle is that with CoolStep;
+effort is the current that CoolStep leaves; instead of the vibration counts the distance from `STALL_ANGLE` at which a
+stall would be detected. A trial counts as stopped if steps are lost, or if the axis' own load would be detected as a
+stall.
 """
 
 from __future__ import annotations
@@ -43,13 +44,13 @@ from mechanics.arrays import Floats, Integers, Mask
 WORKING_SHARE, RAMP_SHARE = 0.5, 0.15  # of the motor's corner speed; of the holding torque at the run current
 REACH_SHARE, LONGEST = 0.9, 100.0  # of the travel, and at most [rad]
 MOST_ACCELERATION = 2000.0  # rad/s^2
-MISSED = math.radians(10.0)  # of the angle at which a stall is seen, that counts as a vibration of 0.1 full steps
-SEEN_LATEST = math.radians(80.0)  # beyond it, steps are lost before the stall is seen
+MISSED = math.radians(10.0)  # error of a stall's angle that counts like a vibration of 0.1 full steps
+SEEN_LATEST = math.radians(80.0)  # beyond this angle steps are lost before the stall is detected
 ON_FROM = 0.8  # of the working speed, from which CoolStep acts in a trial
 
 
 class LoadDetectionTrials(OpenLoopTrials):
-    """Runs trials of a load detection, as `Trials` does of loops; every trial ends where it began."""
+    """Runs trials of load detection settings, as `Trials` does of loops; every trial ends where it began."""
 
     STATE = (*OpenLoopTrials.STATE, "_away", "_acceleration", "_per_volt")
     returns = True
@@ -61,10 +62,11 @@ class LoadDetectionTrials(OpenLoopTrials):
         self._away, self._acceleration, self._per_volt = np.ones((3, count))
 
     def identify(self, reach: Floats, where: Mask) -> tuple[Identified, Integers]:
-        """Identify the axes, and how many counts of the reading a volt has.
+        """Identify the axes, and the counts of the reading per volt.
 
         Raises:
-            RuntimeError: If the travel is too short for the working speed, or the reading does not follow the speed.
+            RuntimeError: If the travel is too short for the working speed, or the reading does not change with the
+                speed.
         """
         found, origin = super().identify(reach, where)
         drives, motor = self._drives, self._motor
@@ -97,7 +99,7 @@ class LoadDetectionTrials(OpenLoopTrials):
         write_gains(drives, gains, where)
         change = volts(motor, run, self._speed, fast.angle) - volts(motor, run, SLOW * self._speed, slow.angle)
         per_volt = (fast.reading - slow.reading) / change
-        # An axis of which the reading tells nothing is scored as one whose stall is never seen.
+        # An axis with an unusable reading is scored as one whose stall is never detected.
         known = np.isfinite(per_volt) & (per_volt > 0.0) & (fast.reading < FULL_READING)
         self._per_volt = np.where(where, np.where(known, per_volt, 0.0), self._per_volt)
         self.recover(where)
@@ -106,7 +108,7 @@ class LoadDetectionTrials(OpenLoopTrials):
     def run(  # type: ignore[override]
         self, gains: Integers, incumbent: Integers, move: Move, origin: Integers, direction: Integers, where: Mask
     ) -> OpenLoopTrial:
-        """Try settings in moves there and back; as `Trials.run` has it, but the trial ends where it began."""
+        """Try settings in moves there and back; as `Trials.run`, but the trial ends where it began."""
         drives, device = self._drives, device_of(self._drives)
         run, _ = run_and_standby(device, gains)
         moves = self._moves(origin)
@@ -137,14 +139,14 @@ class LoadDetectionTrials(OpenLoopTrials):
         return np.stack([self._whole_lanes(phase) for phase in axes])
 
     def _stall_angle(self, plain: Steady, run: Floats) -> Floats:
-        """Return the load angle at which the reading would fall to 0 [rad], nan where it never does."""
+        """Return the load angle at which the reading would fall to 0 [rad]; nan if it never does."""
         per_angle = self._per_volt * flux(self._motor, run) * self._speed
         left = falls(plain.angle) - plain.reading / np.where(per_angle > 0.0, per_angle, np.nan)
         seen = np.isfinite(left) & (plain.reading < FULL_READING)
         return np.where(seen, angle_of(np.where(seen, left, 0.0)), np.nan)
 
     def _terms(self, gains: Integers, plain: Steady, cooled: Steady, seen: Floats) -> OpenLoopTerms:
-        """Return the terms of a phase, (num_axes,) each; without samples the worst that they could be."""
+        """Return the terms of a phase, (num_axes,) each; missing samples get the worst possible values."""
         one = np.ones(len(gains))
         angle = np.nan_to_num(cooled.settled, nan=0.5 * math.pi)
         left = np.sin(np.abs(plain.settled)) / np.maximum(np.sin(np.clip(np.abs(angle), 1e-3, 0.5 * math.pi)), 1e-3)
@@ -182,6 +184,6 @@ class LoadDetectionTrials(OpenLoopTrials):
 
 
 def is_load_detection(device: Device, names: tuple[str, ...]) -> bool:
-    """Return whether gains of these names set a load detection, by which nothing moves."""
+    """Return whether gains of these names are settings of load detection or CoolStep."""
     rows = {row.name: row.loop for row in device.gains.rows}
     return bool(names) and any(rows.get(name) in LOAD_DETECTION for name in names)

@@ -1,6 +1,6 @@
 """How a device's gains are tried: trials, first gains, rule and cost of a cascade of loops, and of an open loop.
 
-Which of them a device has is an answer of its gain set. Whatever tries gains asks for its method and knows no more.
+The gain set determines the method. Code that tries gains gets it from `method_of` and needs to know nothing else.
 """
 
 from __future__ import annotations
@@ -33,26 +33,26 @@ if TYPE_CHECKING:
     from drive_env.trials.positioning import Move
 
 
-# What moves an axis of which nothing is known but its motor: the commissioning presets' bandwidths, three rotors.
+# Gains that can move an axis of which only the motor is known: the commissioning presets' bandwidths, three rotors.
 FIRST_HZ = {"current_hz": 1000.0, "velocity_hz": 20.0, "position_hz": 5.0}
 # The baseline rule at a sixth of its speed and half its position gain, with which no elastic axis of the public suite
-# oscillates: where a safe search begins.
+# oscillates: start of a safe search.
 SAFE_RULE = BASELINE_RULE._replace(speed=BASELINE_RULE.speed / 6.0, position=0.5 * BASELINE_RULE.position)
 
-# CoolStep where a search begins: the lowest threshold, a band above it, quick up and slow down.
+# CoolStep at the start of a search: the lowest threshold, a narrow band above it, fast up and slow down.
 FIRST_COOLSTEP = {LOWER: 1, WIDTH: 2, DOWN: 2, UP: 3}
 
-SLOW = 1.0 / 3.0  # of the gains of a stepper's closed loop, where a safe search begins
-SLOW_I = SLOW**2  # of the integral gain of a PID: as slow in time as its P
+SLOW = 1.0 / 3.0  # of the gains of a stepper's closed loop, at the start of a safe search
+SLOW_I = SLOW**2  # of the integral gain of a PID: it then has the same time scale as its P
 
 
 @dataclass(frozen=True)
 class Cascade:
-    """Loops of which a rule knows gains from the motor's data.
+    """A cascade of loops, whose gains a rule computes from the motor's data.
 
-    What tries gains asks this of a kind of gain set; gains are raw, (n, count). `measures_current` is whether the drive
-    tells the torque current, by which oscillation is seen; `caution` is 1 where higher gains come nearer to a trial
-    that is stopped, -1 where lower ones do.
+    The methods below are the interface for all kinds of gain sets; gains are raw, (n, count).
+    `measures_current`: Whether the drive measures the torque current, which shows oscillation.
+    `caution`: 1 if higher gains are closer to a stopped trial, -1 if lower ones are.
     """
 
     device: Device
@@ -69,13 +69,13 @@ class Cascade:
         return self.device.gains.highest
 
     def first(self, supply: Floats) -> Integers:
-        """Return gains for a total inertia of three rotors."""
+        """Return gains for a total inertia of three rotors, by the supply voltages [V], (n,)."""
         inertia = 3.0 * self.motor.inertia
         rows = [bandwidth_gains(self.device, self.motor, inertia, supply=float(v), **FIRST_HZ) for v in supply]
         return np.array(rows, np.int64)
 
     def plan(self, found: Identified, scaler: ArrayLike, reach: ArrayLike) -> Move:
-        """Return the move of trials; arguments as `positioning.plan_move` has them."""
+        """Return the move of trials; arguments as in `positioning.plan_move`."""
         return plan_move(self.motor, found.inertia, scaler, reach, highest_ramp(self.device))
 
     def rule(self, found: Identified, move: Move, supply: Floats) -> Integers:
@@ -83,27 +83,27 @@ class Cascade:
         return self._rule(BASELINE_RULE, found, supply)
 
     def safe(self, found: Identified, move: Move, supply: Floats) -> Integers:
-        """Return slow ones."""
+        """Return slow gains that start a safe search."""
         return self._rule(SAFE_RULE, found, supply)
 
     def keep(self, gains: Integers, present: Integers) -> Integers:
-        """Return gains as they are: all of them are the rule's."""
+        """Return gains unchanged: all of them are the rule's."""
         return gains
 
     def trials(self, drives: Drives, axes: int) -> Trials:
-        """Return the trials of these drives."""
+        """Return the runner of trials on these drives."""
         return Trials(drives, self.motor, axes, self.t_0())
 
     def softness(self, gains: Integers) -> Floats:
-        """Return it by the integrators."""
+        """Return the softness of gains under a load, computed from the integrators."""
         return softness(self.device.gains, gains)
 
     def cost(self, terms: Terms) -> Floats:
-        """Return J."""
+        """Return J from its terms."""
         return cost(terms)
 
     def current(self, terms: Terms) -> Floats:
-        """Return its ripple."""
+        """Return the current's ripple among the terms."""
         return terms.noise
 
     def _rule(self, rule: Any, found: Identified, supply: Floats) -> Integers:
@@ -113,9 +113,9 @@ class Cascade:
 
 @dataclass(frozen=True)
 class OpenLoop:
-    """Currents of a stepper that follows its field: in open loop no drive tells a torque current.
+    """Currents of a stepper in open loop: no torque current is measured.
 
-    Lower currents lose steps. What is said of `Cascade` holds for its members.
+    Lower currents lose steps. For the members see `Cascade`.
     """
 
     device: Device
@@ -128,7 +128,7 @@ class OpenLoop:
         return swing_period(self.motor)
 
     def highest(self) -> Integers:
-        """Return the greatest integers, of currents those of the motor's rated one."""
+        """Return the greatest integers of the gains; those of currents are the motor's rated current."""
         full = with_currents(self.device, self.motor, self.device.gains.highest.max(), self.device.gains.highest.max())
         currents = self.device.gains.columns(self.device.gains.outer)
         most = self.device.gains.highest.copy()
@@ -148,7 +148,7 @@ class OpenLoop:
         return plan_move(self.motor, found.inertia, scaler, reach, highest_ramp(self.device), share)
 
     def rule(self, found: Identified, move: Move, supply: Floats) -> Integers:
-        """Return currents with which the load takes 30 degrees of load angle in the move."""
+        """Return currents with which the load causes 30 degrees of load angle in the move."""
         constant = self.motor.torque_constant
         speed, acceleration = move.velocity / move.increments, move.acceleration / move.increments
         moving = found.inertia * acceleration + constant * (
@@ -157,41 +157,40 @@ class OpenLoop:
         return currents_for(self.device, self.motor, moving, constant * found.offset)
 
     def safe(self, found: Identified, move: Move, supply: Floats) -> Integers:
-        """Return the rated current: nothing holds a stepper better."""
+        """Return the rated current, which holds a stepper best."""
         return self.first(supply)
 
     def keep(self, gains: Integers, present: Integers) -> Integers:
-        """Return gains with those of other loops, and of the load detection, that drives have at present."""
+        """Return gains in which those of other loops, and of the load detection, keep their present values."""
         kept, own = present.copy(), self._columns()
         kept[:, own] = gains[:, own]
         return kept
 
     def trials(self, drives: Drives, axes: int) -> OpenLoopTrials:
-        """Return the trials of these drives."""
+        """Return the runner of trials on these drives."""
         return OpenLoopTrials(drives, self.motor, axes, self.t_0())
 
     def softness(self, gains: Integers) -> Floats:
-        """Return it by the standby current."""
+        """Return the softness of gains under a load, computed from the standby current."""
         return open_loop_softness(self.device, gains)
 
     def cost(self, terms: Any) -> Floats:
-        """Return J."""
+        """Return J from its terms."""
         return np.asarray(open_loop_cost(terms))
 
     def current(self, terms: Any) -> Floats:
-        """Return the RMS of the currents that are set, or of what CoolStep leaves of them."""
+        """Return the RMS of the set currents, or of the current that CoolStep leaves."""
         return np.asarray(np.sqrt(terms.effort))
 
     def _columns(self) -> list[int]:
-        """Return which gains are its own."""
         return list(self.device.gains.columns(self.device.gains.outer))
 
 
 @dataclass(frozen=True)
 class ClosedStepper(OpenLoop):
-    """A stepper whose drive closes a loop around it: the gains that act there alone, at the motor's rated current.
+    """A stepper whose drive closes a loop around it: gains that act only there, at the motor's rated current.
 
-    It is identified in open loop; its trials look at the torque current by themselves. Higher gains oscillate.
+    It is identified in open loop; its trials evaluate the torque current themselves. Higher gains oscillate.
     """
 
     loop: ClosedLoop
@@ -202,7 +201,7 @@ class ClosedStepper(OpenLoop):
         return pid_time(self.loop) if self.loop.kind == PID_ALONE else super().t_0()
 
     def first(self, supply: Floats) -> Integers:
-        """Return the rated current with the loop's first values, or the commissioned values for it."""
+        """Return the rated current with the loop's first values, or the commissioned values if it has none."""
         gains = super().first(supply)
         dictionary = self.device.new_dictionary()
         entries = [(dictionary.find(name), value) for name, value in self.device.preset(self.motor).items()]
@@ -213,17 +212,17 @@ class ClosedStepper(OpenLoop):
         return gains
 
     def plan(self, found: Identified, scaler: ArrayLike, reach: ArrayLike) -> Move:
-        """Return a move that overloads the motor; for a PID one that it follows."""
+        """Return a move that overloads the motor; for a PID a move that it can follow."""
         if self.loop.is_pid:
             return plan_pid(self.motor, self.loop, found, scaler, reach)
         return plan_overload(self.device, self.motor, found, scaler, reach)
 
     def rule(self, found: Identified, move: Move, supply: Floats) -> Integers:
-        """Return the commissioned gains: no rule knows such a loop."""
+        """Return the first gains: no rule exists for such a loop."""
         return self.first(supply)
 
     def safe(self, found: Identified, move: Move, supply: Floats) -> Integers:
-        """Return a third of that: slower to catch up."""
+        """Return a third of the first gains, which catch up more slowly."""
         gains, known = self.first(supply), self.device.gains
         if not self.loop.is_pid:
             return known.scaled(gains, SLOW, self._loop_columns())
@@ -232,22 +231,22 @@ class ClosedStepper(OpenLoop):
         return known.scaled(known.scaled(gains, SLOW, [p]), SLOW_I, [i])
 
     def trials(self, drives: Drives, axes: int) -> ClosedLoopTrials:
-        """Return the trials of these drives."""
+        """Return the runner of trials on these drives."""
         kind = PidTrials if self.loop.is_pid else ClosedLoopTrials
         return kind(drives, self.motor, axes, self.t_0(), self.loop)
 
     def softness(self, gains: Integers) -> Floats:
-        """Return 1: how an overload is caught up with is measured in each trial; of a PID it by its gains' model."""
+        """Return 1, since every trial measures the recovery from an overload; for a PID a model's load step."""
         if self.loop.is_pid:
             return load_step_error(self.device, self.motor, self.loop, gains)
         return np.ones(len(gains))
 
     def cost(self, terms: Terms) -> Floats:
-        """Return J."""
+        """Return J from its terms."""
         return cost(terms)
 
     def current(self, terms: Terms) -> Floats:
-        """Return the ripple of the torque current; of a PID, where none is measured, the vibration as J counts it."""
+        """Return the ripple of the torque current; for a PID, which measures none, the vibration in the unit of J."""
         return terms.noise
 
     def _loop_columns(self) -> list[int]:
@@ -259,14 +258,14 @@ class ClosedStepper(OpenLoop):
 
 @dataclass(frozen=True)
 class LoadSettings(OpenLoop):
-    """A stepper's threshold of the load detection and CoolStep, at the motor's rated current or what a load needs.
+    """A stepper's threshold of load detection and its CoolStep, with the currents that the load needs.
 
-    Higher thresholds of CoolStep leave more current; a threshold too low stops an axis that is not blocked. The move of
-    these trials follows from the working speed, whatever `plan` says.
+    Higher thresholds of CoolStep leave more current; a low threshold stops an axis that is not blocked. The move of
+    these trials follows from the working speed instead of `plan`.
     """
 
     def rule(self, found: Identified, move: Move, supply: Floats) -> Integers:
-        """Return the currents for the load, the threshold 0, and a CoolStep that takes little away."""
+        """Return the currents for the load, a threshold of 0, and a CoolStep that reduces the current only a little."""
         gains = super().rule(found, move, supply)
         for part, value in FIRST_COOLSTEP.items():
             column = self.device.gains.column(*part)
@@ -275,11 +274,11 @@ class LoadSettings(OpenLoop):
         return gains
 
     def trials(self, drives: Drives, axes: int) -> LoadDetectionTrials:
-        """Return the trials of these drives."""
+        """Return the runner of trials on these drives."""
         return LoadDetectionTrials(drives, self.motor, axes, self.t_0())
 
     def softness(self, gains: Integers) -> Floats:
-        """Return 1: no load step is part of it."""
+        """Return 1: no load step is part of the cost."""
         return np.ones(len(gains))
 
     def _columns(self) -> list[int]:
@@ -290,7 +289,7 @@ Method = Cascade | OpenLoop
 
 
 def method_of(device: Device, motor: Motor, names: tuple[str, ...] = ()) -> Method:
-    """Return how gains of a device are tried; with names of gains that act in a closed loop alone with it closed."""
+    """Return the method for gains of a device; names of gains that act only in a closed loop select this loop."""
     if (loop := device.gains.loop_of(names)) is not None:
         return ClosedStepper(device, motor, loop)
     if is_load_detection(device, names):
@@ -299,7 +298,7 @@ def method_of(device: Device, motor: Motor, names: tuple[str, ...] = ()) -> Meth
 
 
 def check_tried(device: Device, names: tuple[str, ...]) -> None:
-    """Raise ValueError, before anything moves, unless trials can show the effect of gains of these names."""
+    """Raise ValueError, before anything moves, unless trials can show the effect of gains with these names."""
     if not names and not device.gains.outer:
         raise ValueError(
             f"{device.name} has no gains of a velocity or position loop and no phase currents, which trials could "
@@ -338,9 +337,9 @@ def check_tried(device: Device, names: tuple[str, ...]) -> None:
 def new_score(
     device: str, load: Any, motor: Any, num_machines: int, *, gains: tuple[str, ...] = (), **options: Any
 ) -> RobustScore:
-    """Return the score of a device's gains on emulated machines; arguments as `RobustScore` has.
+    """Return the score of a device's gains on emulated machines; arguments as in `RobustScore`.
 
-    With `gains`, names, that act in a closed loop alone it is closed.
+    Names in `gains` that act only in a closed loop select this loop.
     """
     from drive_env.devices import find_device
     from drive_env.trials.closed_loop_score import ClosedLoopScore

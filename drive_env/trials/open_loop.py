@@ -1,10 +1,9 @@
 """One trial of the currents of an open-loop stepper: a move, the reversal, and the current probe.
 
-No loop is closed, and no torque current is measured: 6077h, where there is one, is the size of the current. What a
-master sees is the encoder against the step counter: their difference is the load angle, which is the torque over the
-holding torque, and jumps by four full steps where the motor falls out of step. Inertia and friction are identified from
-it, and settling, load angle, vibration and lost steps are seen by it. What the currents cost is known from their
-settings.
+No loop is closed, and no torque current is measured: 6077h, if it exists, is the size of the set current. A master can
+compare the encoder with the step counter: their difference is the load angle, whose sine is the torque over the holding
+torque, and it jumps by four full steps if the motor loses steps. Inertia, friction, settling, load angle, vibration and
+lost steps are all computed from it. The cost of the currents is known from their settings.
 """
 
 from __future__ import annotations
@@ -48,26 +47,26 @@ from mechanics.arrays import Floats, Integers, Mask
 
 PROBE = 0.8  # run current of the probe over that of the trial
 LOST = 2.0  # full steps between field and rotor: beyond the unstable balance, from where it falls to the next tooth
-TOOTH = 4.0  # full steps: what a rotor falls behind
-BAND_STEPS = 0.05  # of a full step, in which an axis has settled at least: dry friction holds it off the field's angle
-ENCODER, NO_WINDOW = 0, 0  # of 606Ah and 6065h
+TOOTH = 4.0  # full steps by which a rotor falls behind when it loses steps
+BAND_STEPS = 0.05  # of a full step, least settling band: dry friction holds an axis away from the field's angle
+ENCODER, NO_WINDOW = 0, 0  # values of 606Ah and 6065h
 OPEN = 0  # of `Role.LOOP_MODE`
-STILL = 20  # samples at rest by which demand and encoder are compared
-REST, LONGEST_ROLL = 0.25, 100  # full steps in that time, of a rotor at rest; times that it is waited for
-TURNING_BACK = 10  # ms within which a rotor that swings comes back
-LEAST_WAY = 0.25  # of a move that an encoder must show
-# Total inertia in rotors for which the moves of identification are made, one after the other, until one loses no steps.
+STILL = 20  # samples at rest over which demand and encoder are compared
+REST, LONGEST_ROLL = 0.25, 100  # full steps between two checks, of a rotor at rest; greatest number of checks
+TURNING_BACK = 10  # ms within which a swinging rotor reverses
+LEAST_WAY = 0.25  # of a move, that an encoder must show
+# Total inertias, in rotors, for which the moves of identification are planned, in this order, until no steps are lost.
 TRIED_ROTORS = (3.0, 12.0, 48.0, 192.0)
 
-# The swing by which the inertia of a light load is found: its step and how far apart its two places are [full steps],
-# the time until the one before has died away [s], speed and ramps in full steps, as far as a drive takes them.
+# The swing by which the inertia of a light load is found: its step and the distance of its two positions [full steps],
+# time for the last swing to decay [s], speed and ramps in full steps, up to the drive's limits.
 SWING_STEP, SWING_APART, SWING_REST = 0.25, 0.5, 0.1
-SWING_ROOM = 1.5  # full steps of travel, less than which leave no room to swing and to overshoot
+SWING_ROOM = 1.5  # full steps of travel that a swing with overshoot needs
 STEEP = {cia402.PROFILE_VELOCITY: 1e3, cia402.PROFILE_ACCELERATION: 2e7, cia402.PROFILE_DECELERATION: 2e7}
 _STEEPNESS = tuple(STEEP)
-HIGHEST_SHARE = 0.95  # of the highest value that a drive takes
-RAMP_ANGLE = 0.3  # sine of the load angle in the ramp, from which on that tells the inertia
-STIFF_SHARE = 0.6  # of the ramp's inertia, below which a swing is that of the rotor against an elastic load
+HIGHEST_SHARE = 0.95  # of the greatest value that a drive accepts
+RAMP_ANGLE = 0.3  # sine of the load angle in the ramp, above which the ramp gives the inertia
+STIFF_SHARE = 0.6  # of the ramp's inertia: a smaller result means that the rotor swung against an elastic load
 
 # Scales of the terms of J.
 LOAD_ANGLE = 0.5  # full steps, 45 degrees electrical: 30 % of the torque are left
@@ -75,21 +74,21 @@ VIBRATION = 0.1  # full steps from millisecond to millisecond
 OVERSHOOT_FREE, OVERSHOOT_SCALE = 0.02, 0.1
 
 
-# Of the holding torque, that a ramp may ask for at once: a rotor that is pulled suddenly swings beyond the angle of the
-# torque, and comes back from up to 0.725 of it (equal areas under the sine of the torque). The rest is left to what the
-# current lacks at speed.
+# Share of the holding torque that a ramp may apply suddenly: the rotor then swings beyond the angle of the torque, and
+# returns up to 0.725 of it (equal areas under the sine of the torque). AT_SPEED is a reserve for the missing current at
+# speed.
 PULLED_AT_ONCE = 0.725
 AT_SPEED = 0.9
-LEAST_ACCELERATION = 0.15  # of the rated torque, where friction takes nearly all
+LEAST_ACCELERATION = 0.15  # of the rated torque, even if friction takes nearly all of it
 
 
 def acceleration_share(device: Device, motor: Motor, taken: ArrayLike = 0.0) -> Floats:
-    """Return the share of the rated torque that may accelerate an axis in a trial without a lost step in its probe.
+    """Return the share of the rated torque that may accelerate an axis in a trial without lost steps in its probe.
 
     Args:
-        device: The drive, which may give less than the motor's rated current.
+        device: The drive, which may be limited below the motor's rated current.
         motor: The motor.
-        taken: Torque that friction and a constant load take [N m], (num_axes,).
+        taken: Torque of friction and a constant load [N m], (num_axes,).
     """
     held = holding_torque(motor, PROBE * amplitude(device, rated_setting(device, motor)))
     free = AT_SPEED * PULLED_AT_ONCE * held - np.asarray(taken, float) - motor.cogging_torque
@@ -97,11 +96,15 @@ def acceleration_share(device: Device, motor: Motor, taken: ArrayLike = 0.0) -> 
 
 
 class OpenLoopTerms(NamedTuple):
-    """The terms of J of an open-loop stepper, each of one shape.
+    """The terms of J of an open-loop stepper, all of the same shape.
 
-    settling: t_s/t_0. disturbance: E_d/E_0. noise: Vibration of the rotor about the field, full steps. overshoot: Over
-    the move. tripped: A fault, or steps lost. load_angle: Largest, full steps (one is 90 degrees electrical). effort:
-    Mean square of the currents that are set over the rated one.
+    settling: t_s/t_0.
+    disturbance: E_d/E_0.
+    noise: Vibration of the rotor about the field [full steps].
+    overshoot: Over the move.
+    tripped: A fault, or lost steps.
+    load_angle: Greatest load angle [full steps]; one is 90 degrees electrical.
+    effort: Mean square of the set currents over the rated one.
     """
 
     settling: Floats
@@ -122,9 +125,9 @@ def open_loop_cost(terms: OpenLoopTerms) -> Floats:
 
     J = (t_s/t_0)^0.4 (E_d/E_0)^0.4 q^0.4 (1 + (a/0.5)^2)^0.2 (1 + (n/0.1)^2)^0.2 (1 + max(0, os - 2 %)/10 %)
 
-    with q the effort, a the load angle and n the vibration in full steps; beyond 15 it is bent as
-    `score.cost` is, and lost steps cost 30. The ripple of the current, which J of a servo has, is not among them: the
-    drive does not measure its current.
+    with q the effort, a the load angle and n the vibration in full steps; beyond 15 it is bent as in `score.cost`, and
+    lost steps cost 30. The ripple of the current in a servo's J is missing, since the drive does not measure its
+    current.
     """
     raw = (
         terms.settling**0.4
@@ -138,7 +141,7 @@ def open_loop_cost(terms: OpenLoopTerms) -> Floats:
 
 
 class OpenLoopTrial(NamedTuple):
-    """The result of a trial, as `gain_trial.Trial` has it; where an axis was stopped, it had lost steps or tripped.
+    """The result of a trial, with the interface of `gain_trial.Trial`; stopped axes had lost steps or tripped.
 
     lost: Whether steps were lost, (phases, num_axes).
     """
@@ -154,45 +157,45 @@ class OpenLoopTrial(NamedTuple):
         """Return J by measured terms of every phase, (phases, num_axes).
 
         Args:
-            softness: Of the trial's currents over that of the rule's, (num_axes,), for E_d/E_0.
+            softness: Softness of the trial's currents over that of the rule's, (num_axes,), as a factor of E_d/E_0.
         """
         disturbance = np.broadcast_to(softness, self.aborted.shape)
         return open_loop_cost(self.terms._replace(disturbance=disturbance, tripped=self.aborted))
 
 
 def unmeasured(device: Device) -> str:
-    """Return why an open loop has no torque current to score, for people."""
+    """Return why an open loop has no torque current to score, for messages."""
     if (cia402.TORQUE_ACTUAL, 0) in device.bindings:
         return "in open loop 6077h is the size of the current that is set"
     return "no 6077h"
 
 
 def _highest(drives: Drives, name: int) -> float:
-    """Return the highest value of an object that drives take, less the shortfall that a profile may have."""
+    """Return the greatest value of an object that drives accept, less a reserve for rounding of the profile."""
     high = device_of(drives).new_dictionary().find(name).high
     assert high is not None, "ramps and speeds are numbers"
     return HIGHEST_SHARE * high
 
 
 def encoder_age(device: Device) -> float:
-    """Return how old an encoder's count is when it is read [s]: it is taken once in each period of the motion loops."""
+    """Return the age of an encoder's count when it is read [s]: it is sampled once per period of the motion loops."""
     return 1.0 / device.velocity_rate
 
 
 def open_loop_softness(device: Device, gains: Integers) -> Floats:
     """Return a number proportional to the deflection by a load at rest, (num_axes,): one over the standby current.
 
-    No load step exists on a bus; but a rotor in its field gives way by T / (n_p T_hold), and the holding torque follows
-    from the current.
+    Load steps are impossible on a bus; but a rotor in its field is turned by T / (n_p T_hold), and the holding torque
+    follows from the current.
     """
     return np.asarray(1.0 / run_and_standby(device, gains)[1])
 
 
 def effort(device: Device, motor: Motor, gains: Integers) -> Floats:
-    """Return the mean square of the currents that are set over the rated one, (num_axes,): copper loss of a trial.
+    """Return the mean square of the set currents over the rated one, (num_axes,): copper loss of a trial.
 
-    The run current for the profile, the standby current for the rest. It is the setting's, whatever lowers the current
-    meanwhile (CoolStep) or delays it (the standby delay): on a bus nothing else is seen.
+    The run current counts during the profile, the standby current during the rest. Effects that lower the current
+    (CoolStep) or delay it (the standby delay) are ignored, since a bus does not show them.
     """
     run, standby = run_and_standby(device, gains)
     share = PROFILE / TRIAL
@@ -200,7 +203,7 @@ def effort(device: Device, motor: Motor, gains: Integers) -> Floats:
 
 
 def with_run_current(device: Device, gains: Integers, factor: float | Floats) -> Integers:
-    """Return gains of shape (n, count) with the run current times a factor, down to the next of its steps."""
+    """Scale the run current of gains, shape (n, count), by a factor, rounded down."""
     column = device.gains.column(*RUN)
     assert column is not None, "an open loop has a run current"
     changed = gains.copy()
@@ -211,11 +214,10 @@ def with_run_current(device: Device, gains: Integers, factor: float | Floats) ->
 class OpenLoopTrials(Trials):
     """Runs trials on open-loop steppers, as `Trials` does on servo drives; the axes of a machine are stopped together.
 
-    Nothing acts by the load reading meanwhile, unless `acts_by_load`: no stall stops an axis, no CoolStep lowers its
-    current. 606Ah is set to the encoder while the drives are disabled, a loop that is closed is opened, and 6065h
-    watches no longer, with which no axis that has lost steps could be enabled again; `sensor`, `loop` and `window` are
-    what they were. Positions are the encoder's; what has been lost in steps is made up for in the targets that the step
-    counter gets.
+    During trials nothing reacts to the load reading unless `acts_by_load` is set: no stall stops an axis, no CoolStep
+    lowers its current. While the drives are disabled, 606Ah is set to the encoder, a closed loop is opened, and 6065h
+    is switched off, since it would keep axes with lost steps from being enabled again; `sensor`, `loop` and `window`
+    are the values before. Positions are the encoder's; lost steps are added to the targets that the step counter gets.
     """
 
     STATE: tuple[str, ...] = ("sensor", "window", "loop", "acts_by_load", "_speeds", "_zero", "_fell")
@@ -226,12 +228,12 @@ class OpenLoopTrials(Trials):
         self.window: Integers | None = None
         self.loop: Integers | None = None
         self.acts_by_load = False
-        self._speeds: dict[Role, Integers] = {}  # of load detection and CoolStep, as they were
+        self._speeds: dict[Role, Integers] = {}  # speeds of load detection and CoolStep before the trials
         self._zero: Floats | None = None
-        self._fell = False  # steps were lost, and the rotor may still be on its way to the next tooth
+        self._fell = False  # steps were lost, and the rotor may still be moving to the next tooth
 
     def recover(self, where: Mask) -> None:
-        """Bring axes to pp, enabled, by the encoder, whatever state they are in."""
+        """Bring axes in any state to pp, enabled, with the encoder as position sensor."""
         drives = self._drives
         now = drives.read(cia402.SENSOR_SELECTION)
         if self.sensor is None:
@@ -251,19 +253,19 @@ class OpenLoopTrials(Trials):
         super().recover(where)
 
     def _recorded(self) -> list[Any]:
-        """Return the objects of a trial, all together: some drives change no mapping while an axis is enabled."""
+        """Return all objects of a trial: some drives cannot change their mapping while an axis is enabled."""
         objects: list[Any] = [cia402.POSITION_ACTUAL, cia402.POSITION_DEMAND, cia402.STATUSWORD]
         return [*objects, cia402.TORQUE_ACTUAL] if device_of(self._drives).gains.closed_loops else objects
 
     def power_up(self, where: Mask) -> None:
-        """Take drives that were switched on just now to pp, enabled, by the encoder."""
+        """Enable newly switched-on drives in pp, with the encoder as position sensor."""
         self._drives.write(cia402.SENSOR_SELECTION, ENCODER, where=where)
         self._watch_no_window()
         self._let_load_alone(where)
         super().power_up(where)
 
     def _let_load_alone(self, where: Mask) -> None:
-        """Have nothing act by the load reading: stop on stall is off at 0, CoolStep beyond all speeds."""
+        """Disable reactions to the load reading: stop on stall with speed 0, CoolStep with a speed above all."""
         drives, device = self._drives, device_of(self._drives)
         if self.acts_by_load:
             return
@@ -277,13 +279,13 @@ class OpenLoopTrials(Trials):
                     drives.write(role, off, where=acting)
 
     def _watch_no_window(self) -> None:
-        """Switch 6065h off, which drives have again that were switched on: the encoder shows axes that fall behind."""
+        """Switch 6065h off, which newly switched-on drives have on: the encoder shows axes that fall behind."""
         drives = self._drives
         if np.any(watched := drives.read(cia402.FOLLOWING_WINDOW) != NO_WINDOW):
             drives.write(cia402.FOLLOWING_WINDOW, NO_WINDOW, where=watched)
 
     def _open_loop(self) -> None:
-        """Open the loops that drives have closed: with one closed the load angle says something else."""
+        """Open the loops that drives have closed: with a closed loop the load angle has another meaning."""
         drives = self._drives
         if Role.LOOP_MODE in device_of(drives).roles:
             self.loop = drives.read(Role.LOOP_MODE)
@@ -291,7 +293,7 @@ class OpenLoopTrials(Trials):
                 drives.write(Role.LOOP_MODE, OPEN, where=closed)
 
     def leave(self) -> None:
-        """Put 606Ah and the loop's mode back; the axes must be disabled."""
+        """Restore 606Ah, 6065h, the loop's mode and the speeds of load detection; the axes must be disabled."""
         if self.loop is not None and np.any(opened := self._drives.read(Role.LOOP_MODE) != self.loop):
             self._drives.write(Role.LOOP_MODE, self.loop, where=opened)
         for role, values in self._speeds.items():
@@ -306,14 +308,14 @@ class OpenLoopTrials(Trials):
                 self._drives.write(cia402.SENSOR_SELECTION, self.sensor, where=changed)
 
     def go(self, target: Integers, where: Mask) -> None:
-        """Set off for a position of the encoder."""
+        """Start a move to a position of the encoder."""
         start(self._drives, wrapped(target + self.shift()).astype(np.int64), where)
 
     def identify(self, reach: Floats, where: Mask) -> tuple[Identified, Integers]:
-        """Move there and back with the present currents; return the axes by their load angles, and their starts [inc].
+        """Identify axes by their load angles in moves there and back with the present currents; return starts [inc].
 
-        The weight of the load is unknown: an axis that loses steps in moves for a light one makes slower ones, while
-        the others stand.
+        The inertia is unknown: an axis that loses steps in moves for a light load repeats them more slowly, while the
+        others stand.
 
         Raises:
             RuntimeError: If an encoder hardly moved.
@@ -330,10 +332,10 @@ class OpenLoopTrials(Trials):
         for rotors in TRIED_ROTORS:
             move = plan_move(motor, np.full(count, rotors * motor.inertia), scaler, reach, most, share)
             if before is not None and np.all((move.distance == before)[left]):
-                continue  # speed or travel had ended it, not the load: it would lose the same steps
+                continue  # limited by speed or travel instead of inertia: it would lose the same steps
             before = move.distance
             seen, position, lost = self._identify_by(move, origin, reach, left)
-            # Of an axis that takes no part the first move says what it may: an inertia of 0 no plan could divide by.
+            # Axes that take no part keep the values of the first move: a plan cannot use an inertia of 0.
             found = Identified(*(np.where(left, a, b) for a, b in zip(seen, found or seen, strict=True)))
             self._check_moved(position, move, left & ~lost)
             if not np.any(again := left & lost):
@@ -346,9 +348,9 @@ class OpenLoopTrials(Trials):
         return found, origin
 
     def _start_anew(self, where: Mask, full_step: Floats) -> None:
-        """Have axes that lost steps stand, enabled, and count their steps from here."""
+        """Bring axes that lost steps to rest, enabled, and count their steps from here."""
         drives = self._drives
-        if np.any(on := where & ~self.down()):  # the steps end, and the rotor finds the field again
+        if np.any(on := where & ~self.down()):  # the steps end, and the rotor synchronises with the field
             drives.write(cia402.CONTROLWORD, cia402.ENABLE_OPERATION | cia402.HALT, where=on)
         drives.advance(STILL * CYCLE)
         self._come_to_rest(full_step)
@@ -358,7 +360,7 @@ class OpenLoopTrials(Trials):
         self._zero = np.where(where, now, 0.0 if self._zero is None else self._zero)
 
     def _identify_by(self, move: Move, origin: Integers, reach: Floats, where: Mask) -> tuple[Identified, Floats, Mask]:
-        """Move there and back, and swing; return the identified axes, the encoder's way, and which axes lost steps."""
+        """Move there and back, and swing; return the identified axes, the encoder's way, and axes that lost steps."""
         drives, motor = self._drives, self._motor
         write_profile(drives, move, where)
         objects = [cia402.POSITION_ACTUAL, cia402.POSITION_DEMAND]
@@ -376,7 +378,7 @@ class OpenLoopTrials(Trials):
         lost = (np.abs(lag) > LOST / TOOTH * tooth).any(axis=0) | self.down()
         held = holding_torque(motor, run_and_standby(device_of(drives), read_gains(drives))[0])
         lag -= np.gradient(wrapped(demand - origin) / move.increments, axis=0) / CYCLE * encoder_age(device_of(drives))
-        # The rotor's angle in the field is the torque that it takes; as a current of the motor's torque constant.
+        # The sine of the rotor's angle in the field gives its torque; converted to a current by the torque constant.
         current = held * np.sin(motor.n_p * lag) / motor.torque_constant
         speed = np.gradient(angle, CYCLE, axis=0)
         moving = samples_in_motion(speed, TURNING_BACK)
@@ -385,7 +387,7 @@ class OpenLoopTrials(Trials):
         if not has_room.any():
             return found, position, lost
         swing = self._swing(origin, move, has_room, held)
-        # A heavy load's ramp says more than its swing, in which what is elastic takes no part.
+        # With a heavy load the ramp is more precise than the swing, in which an elastic load takes no part.
         light = has_room & (swing.inertia * move.acceleration / move.increments < RAMP_ANGLE * held)
         light &= swing.inertia > STIFF_SHARE * found.inertia
         if (trusted := light & (swing.explained > EXPLAINED)).any():
@@ -422,9 +424,9 @@ class OpenLoopTrials(Trials):
     def run(  # type: ignore[override]
         self, gains: Integers, incumbent: Integers, move: Move, origin: Integers, direction: Integers, where: Mask
     ) -> OpenLoopTrial:
-        """Try currents in a move from the origin, back, and there again with less; as `Trials.run` has it.
+        """Try currents in a move from the origin, back, and there again with less; otherwise as `Trials.run`.
 
-        Where an axis loses steps or goes into fault, its machine stops, gets the incumbent back and continues with it.
+        If an axis loses steps or goes into fault, its machine stops, gets the incumbent gains back and continues.
         """
         drives, device, count = self._drives, device_of(self._drives), self._drives.num_axes
         away = origin + direction * move.distance
@@ -457,7 +459,7 @@ class OpenLoopTrials(Trials):
     def _try(
         self, target: Integers, incumbent: Integers, stopped: Mask, where: Mask, full_step: Floats
     ) -> tuple[Floats, Floats, Mask, Mask, Mask]:
-        """Move; return position, lag, machines stopped so far, axes that caused it now, and those with steps lost."""
+        """Move; return position, lag, machines stopped so far, axes that newly caused it, and those with lost steps."""
         drives = self._drives
         if self._fell:
             self._come_to_rest(full_step)
@@ -481,14 +483,14 @@ class OpenLoopTrials(Trials):
                 write_gains(drives, incumbent, new)
                 stopped = stopped | new
                 culprit |= new & (down | out)
-            if (on := (new | out) & ~down).any():  # the steps end, and the rotor finds the field again
+            if (on := (new | out) & ~down).any():  # the steps end, and the rotor synchronises with the field
                 drives.write(cia402.CONTROLWORD, cia402.ENABLE_OPERATION | cia402.HALT, where=on)
             if down.any():
                 clear(drives, down)
         return np.concatenate(positions), np.concatenate(lags), stopped, culprit, fell
 
     def _come_to_rest(self, full_step: Floats) -> None:
-        """Wait until no rotor moves: a heavy load rolls over many teeth before the field catches it."""
+        """Wait until no rotor moves: a heavy load rolls over many teeth before it synchronises."""
         drives = self._drives
         for _ in range(LONGEST_ROLL):
             before = drives.read(cia402.POSITION_ACTUAL)
@@ -498,9 +500,9 @@ class OpenLoopTrials(Trials):
         self._fell = False
 
     def shift(self) -> Floats:
-        """Return the step counter's lead over the encoder [inc], by whole teeth of its lead at first.
+        """Return the step counter's lead over the encoder [inc]: the first lead, plus whole teeth.
 
-        Only lost steps are made up for, not the angle by which load and friction turn the rotor in the field.
+        Only lost steps are compensated, not the angle by which load and friction turn the rotor in the field.
         """
         drives = self._drives
         now = wrapped(drives.read(cia402.POSITION_DEMAND) - drives.read(cia402.POSITION_ACTUAL))
@@ -528,13 +530,13 @@ def open_loop_terms(
     """Return t_s/t_0, vibration [full steps], overshoot and load angle [full steps] of a move, (num_axes,) each.
 
     Args:
-        position: The encoder's, from the set-point on, one row per ms, (SETTLED or more, num_axes).
-        lag: Demand less encoder [inc], as long.
+        position: Position by the encoder, from the set-point on, one row per ms, (SETTLED or more, num_axes).
+        lag: Demand less encoder [inc], same shape.
         move: The move.
-        t_0: Settling times are relative to this [s].
-        target: Where it goes [inc].
-        sign: The direction, 1 or -1.
-        full_step: Increments.
+        t_0: Time to which settling is relative [s].
+        target: Target [inc].
+        sign: Direction, 1 or -1.
+        full_step: Increments per full step.
     """
     size = np.maximum(np.abs(move.distance), 1).astype(float)
     width = np.maximum(np.maximum(BAND * size, BAND_COUNTS / move.counts * move.increments), BAND_STEPS * full_step)

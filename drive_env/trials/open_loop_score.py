@@ -1,8 +1,8 @@
 """The robust cost of an open-loop stepper's currents on emulated machines; J is that of `open_loop.py`.
 
-The load step is on the machine, as for servo drives: E_d is what it turns the rotor by in its field, and a current that
-loses steps by it scores as a fault. The variant of the currents is a run current of 0.8 times, as that of a cascade is
-velocity P x 1.5: both ask how far the limit is.
+The load step is applied as for servo drives: E_d is the integral of the rotor's deflection in its field, and a current
+that loses steps scores like a fault. The variant of the currents has 0.8 times the run current, as the variant of a
+cascade has velocity P x 1.5: both test the distance from the limit.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from mechanics.arrays import Integers, Mask
 
 
 class OpenLoopScore(StepperScore):
-    """As `RobustScore`, of open-loop steppers; it has no swings of a measured current, which are nan."""
+    """`RobustScore` for open-loop steppers; swings of the current are nan, since none is measured."""
 
     _cost = staticmethod(open_loop_cost)
 

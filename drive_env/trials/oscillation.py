@@ -1,7 +1,7 @@
 """The criterion of oscillation of a moving axis, for trials, tuners and audits.
 
-RMS change of the current from millisecond to millisecond, over the rated current. The edges of a profile make 0.1 on a
-fast loop; a limit cycle, whose current goes from limit to limit, 1 and more.
+It is the RMS change of the current from millisecond to millisecond, over the rated current. The edges of a profile
+cause 0.1 in a fast loop; a limit cycle, whose current goes from limit to limit, 1 and more.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ NEAR = 10.0  # Hz
 
 
 def shakes(current: NDArray[np.floating], rated_current: float) -> Mask:
-    """Return which axes oscillate.
+    """Return which axes oscillate, (axes,).
 
     Args:
         current: Torque-producing current, a sample per millisecond [A], shape (n, axes).
-        rated_current: Of the motor [A].
+        rated_current: Rated current of the motor [A].
     """
     change = np.diff(current, axis=0)
     return np.asarray(np.sqrt(np.mean(change**2, axis=0)) > OSCILLATION * rated_current)
 
 
 def strongest_frequency(current: NDArray[np.floating]) -> tuple[Floats, Floats]:
-    """Return at which frequency each axis' current swings most [Hz], and the share of its power within 10 Hz of that.
+    """Return the frequency of the strongest oscillation of each axis' current [Hz], and the share of power within NEAR.
 
-    To 1 over the samples' duration; what swings faster than 500 Hz is seen below it.
+    The resolution is 1 over the samples' duration; frequencies above 500 Hz are aliased below it.
 
     Args:
         current: Torque-producing current, a sample per millisecond [A], shape (n, axes).

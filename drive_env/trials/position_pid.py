@@ -1,10 +1,10 @@
 """One trial of the gains of a stepper's position PID: a move that the motor follows, the reversal, the gain probe.
 
-A PID moves the field until the encoder is where the steps are; the encoder does not commutate. On the ramp's velocity
-it takes away what load and friction turn the rotor by in its field; alone it makes all of the motion. Within the
-motor's torque both show in every move, so that the move is a servo's; that of a PID alone is as short as its lag
-allows. No torque current is measured (6077h is the size of the current that is set): what vibrates is seen by the
-encoder. What a load step would do follows from the gains, as a servo's: see `load_step_error`.
+A PID moves the field until the encoder is at the step counter's position; the encoder does not commutate. With the
+ramp's velocity it compensates the angle by which load and friction turn the rotor in its field; alone it makes the
+whole motion. Within the motor's torque every move shows both, so that the move is a servo's; that of a PID alone is as
+short as its lag allows. No torque current is measured (6077h is the size of the set current): the encoder shows
+vibration. The effect of a load step follows from the gains, as for a servo: see `load_step_error`.
 """
 
 from __future__ import annotations
@@ -40,31 +40,32 @@ from drive_env.trials.positioning import (
 from drive_env.trials.score import LOAD_SHARE, NOISE
 from mechanics.arrays import Floats, Integers, Mask
 
-PID_P, PID_I = ("correction", "velocity"), ("correction", "velocity, integral")  # of the gain set: loop and part
-P_UNIT, I_UNIT, PRESCALER = 256.0, 65536.0, 128.0  # of 202Bh: 1/s; of 202Ch, 202Dh; of the clock
+PID_P, PID_I = ("correction", "velocity"), ("correction", "velocity, integral")  # loop and part in the gain set
+P_UNIT, I_UNIT, PRESCALER = 256.0, 65536.0, 128.0  # units of 202Bh: 1/s; of 202Ch, 202Dh; prescaler of the clock
 CLOCK = 16e6  # Hz, of the motion controller
-MICROSTEPS, MODEL_STEP = 256.0, 1e-4  # of a full step, as commissioned; s
+MICROSTEPS, MODEL_STEP = 256.0, 1e-4  # per full step, as commissioned; s
 PROBE = 1.5  # P of the probe over that of the trial
-ALONE = 8.0  # full steps of a move that a PID makes alone: it is behind by a third of them
-VIBRATION = 0.1  # full steps, by which the encoder changes from millisecond to millisecond: as 3 % of a servo's ripple
-# RMS of the change of that in a look [full steps]: a light rotor that swings as a ramp begins makes 0.2 of it, one that
-# oscillates or rolls over its teeth 0.33 and more.
+ALONE = 8.0  # full steps, longest move of a PID alone, which is behind by a third of it
+VIBRATION = 0.1  # full steps, the encoder's RMS change per millisecond that counts like 3 % of a servo's ripple
+# RMS change of this change in one check [full steps]: a light rotor that swings at the beginning of a ramp causes 0.2,
+# one that oscillates or rolls over its teeth 0.33 and more.
 SHAKES = 0.3
-# Steady speeds [rev/s] at which gains are looked at after a search: trials are too short to show how a rotor swings by
-# the steps of a speed. Time of it, and of a ramp before it [s], and the swing that is worth a word [full steps, RMS].
+# Steady speeds [rev/s] at which gains are checked after a search: trials are too short to show a rotor that swings with
+# the steps of a speed. Duration of each, and of a ramp before it [s], and least swing that is reported [full steps,
+# RMS].
 STEADY_SPEEDS, STEADY, RAMP, SWING = (0.25, 0.5, 1.0, 2.0), 0.4, 0.15, 0.1
-LONGEST_WAY_BACK, BACK, LOOK = 2.0, 0.5, 0.05  # s, full steps, s: what slipped is made up for before the next phase
+LONGEST_WAY_BACK, BACK, LOOK = 2.0, 0.5, 0.05  # s, full steps, s: an axis that slipped catches up before the next phase
 
 
 def load_step_error(device: Device, motor: Motor, loop: ClosedLoop, gains: Integers) -> Floats:
-    """Return the integral of |error| in the time of a load step [microsteps s], by the gains' model, (n,).
+    """Return the integral of |error| during a load step [microsteps s], by a model of the gains, (n,).
 
-    The field is an integrator, and a load of 0.3 of the rated torque turns the rotor in it by e at once (TMC4361 data
-    sheet; f is the clock, div 256 where 202Eh is 0):
+    The field is an integrator, and a load of 0.3 of the rated torque immediately turns the rotor in it by e (TMC4361
+    data sheet; f is the clock, div 256 if 202Eh is 0):
 
         de/dt (1 + 2021h 128 div / f) = -(202Bh / 256 e + 202Ch f / 2^23 int e), at most 202Fh
 
-    and nothing at all within 2022h. The rotor's own swing, which bounds the gains, is no part of it: trials have it.
+    and 0 within 2022h. The rotor's own swing, which limits the gains, is not modelled: trials show it.
     """
     columns = dict(zip(loop.gains.values(), device.gains.columns_of_loop(loop), strict=True))
 
@@ -88,12 +89,12 @@ def load_step_error(device: Device, motor: Motor, loop: ClosedLoop, gains: Integ
 
 
 def pid_time(loop: ClosedLoop) -> float:
-    """Return the time constant [s] of the P part that a search begins with."""
+    """Return the time constant [s] of the P part with which a search begins."""
     return P_UNIT / float(next(iter(loop.first.values())))
 
 
 def plan_pid(motor: Motor, loop: ClosedLoop, found: Identified, scaler: ArrayLike, reach: ArrayLike) -> Move:
-    """Return a move of 60 ms as `plan_move` does, for a PID alone one of `ALONE` full steps at most."""
+    """Plan a move of 60 ms as `plan_move` does; for a PID alone at most `ALONE` full steps long."""
     to = np.asarray(reach, float)
     if loop.kind == PID_ALONE:
         to = np.copysign(np.minimum(np.abs(to), ALONE * full_step(motor) / TRAVEL_SHARE), to)
@@ -103,7 +104,7 @@ def plan_pid(motor: Motor, loop: ClosedLoop, found: Identified, scaler: ArrayLik
 def pid_terms(
     position: Floats, lag: Floats, move: Move, t_0: float | Floats, target: Integers, sign: Integers, step: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """Return t_s/t_0, vibration as J counts a ripple, and overshoot of a move; arguments as `open_loop_terms` has."""
+    """Return t_s/t_0, vibration in units of J's ripple, and overshoot of a move; arguments as `open_loop_terms`."""
     settling, _, overshoot, _ = open_loop_terms(position, lag, move, t_0, target, sign, step)
     change = wrapped(np.diff(position[QUIET:SETTLED], axis=0))
     vibration = np.sqrt(np.mean(change**2, axis=0)) / step
@@ -111,21 +112,21 @@ def pid_terms(
 
 
 def steps_of(move: Move, motor: Motor) -> Floats:
-    """Return the increments of a full step, (num_axes,)."""
+    """Return the increments per full step, (num_axes,)."""
     return np.asarray(2.0 * np.pi * move.increments / (TOOTH * motor.n_p))
 
 
 def following_scale(move: Move, motor: Motor, loop: ClosedLoop) -> Floats:
-    """Return the scale of |demand - encoder| [inc]: a full step, for a PID alone the move."""
+    """Return the scale of |demand - encoder| [inc]: a full step, or the move for a PID alone."""
     if loop.kind == PID_ALONE:
         return np.maximum(np.abs(move.distance), 1).astype(float)
     return steps_of(move, motor)
 
 
 class PidTrials(ClosedLoopTrials):
-    """Runs trials on steppers whose position a PID regulates, as `ClosedLoopTrials` does.
+    """Runs trials on steppers whose position a PID controls, as `ClosedLoopTrials` does.
 
-    An axis whose rotor shakes, or rolls over its teeth, is stopped, and has made up for it when the next phase begins.
+    An axis that oscillates or rolls over its teeth is stopped, and catches up before the next phase.
     """
 
     def _tried(self, gains: Integers, move: Move, *, is_probe: bool) -> Integers:
@@ -137,7 +138,7 @@ class PidTrials(ClosedLoopTrials):
     def _terms(
         self, position: Floats, current: Floats, move: Move, target: Integers, sign: Integers
     ) -> tuple[Floats, Floats, Floats]:
-        # The load angle that these terms have beside them is no term of a PID.
+        # The load angle, which `open_loop_terms` returns, does not count for a PID.
         step = steps_of(move, self._motor)
         return pid_terms(position, np.zeros_like(position), move, self._t_0, target, sign, step)
 
@@ -145,11 +146,11 @@ class PidTrials(ClosedLoopTrials):
         return following_scale(move, self._motor, self._closed)
 
     def steady_swings(self, reach: Floats, where: Mask) -> Floats:
-        """Return how the rotors swing at `STEADY_SPEEDS` [full steps, RMS], (speeds, num_axes); nan where none fits.
+        """Return the rotors' swing at `STEADY_SPEEDS` [full steps, RMS], (speeds, num_axes); nan without enough room.
 
         Args:
-            reach: How far they may turn from here, with the sign [rad].
-            where: Axes that are looked at.
+            reach: Signed angle that they may turn from here [rad].
+            where: Axes to check.
         """
         drives = self._drives
         scale = np.asarray(drives.read(Role.POSITION_SCALE), float)
@@ -180,13 +181,13 @@ class PidTrials(ClosedLoopTrials):
         return found
 
     def _shaking(self, trace: Mapping[Any, Integers]) -> Mask:
-        """Return whose speed changes from ms to ms as no ramp makes it, or who falls behind a ramp by lost steps."""
+        """Return which axes change their speed faster than a ramp does, or fall behind a ramp by lost steps."""
         scale = np.asarray(self._drives.read(Role.POSITION_SCALE), float)
         step = scale / (TOOTH * self._motor.n_p)
         change = np.diff(wrapped(np.diff(trace[cia402.POSITION_ACTUAL], axis=0)), axis=0)
         most = np.maximum(SHAKES * step, BAND_COUNTS * scale / self._motor.encoder_counts)
         shakes = np.sqrt(np.mean(change**2, axis=0)) > most
-        if self._closed.kind == PID_ALONE:  # is behind its demand in any case
+        if self._closed.kind == PID_ALONE:  # it is always behind its demand
             return np.asarray(shakes)
         lag = np.abs(wrapped(trace[cia402.POSITION_DEMAND] - trace[cia402.POSITION_ACTUAL]))
         return np.asarray(shakes | (lag > LOST * step).any(axis=0))
@@ -200,7 +201,7 @@ class PidTrials(ClosedLoopTrials):
         return found
 
     def _make_up(self, where: Mask) -> None:
-        """Wait until axes are where their demand is, with the incumbent, or for as long as that may take."""
+        """Wait until axes have caught up with their demand with the incumbent gains, at most LONGEST_WAY_BACK."""
         drives = self._drives
         near = BACK * np.asarray(drives.read(Role.POSITION_SCALE), float) / (TOOTH * self._motor.n_p)
         for _ in range(round(LONGEST_WAY_BACK / LOOK)):

@@ -1,7 +1,7 @@
 """The robust cost of the gains of a stepper's position PID on emulated machines: a trial's move, and a load step.
 
-The load step is a servo's, 0.3 of the rated torque: the rotor turns in its field, and the PID brings it back. The
-variant of the gains is P x 1.5, as the trial's probe has it.
+The load step is a servo's, 0.3 of the rated torque: it turns the rotor in its field, and the PID brings it back. The
+variant of the gains has P x 1.5, as the trial's probe.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ CLOSING = 0.01  # s: a PID has no initialisation
 
 
 class PidScore(StepperScore):
-    """As `RobustScore`, of steppers whose position a PID regulates; they have no swing of a measured current: nan.
+    """`RobustScore` for steppers whose position a PID controls; swings of the current are nan, since none is measured.
 
     Args:
-        loop: Which of the device's PIDs.
-        options: As `RobustScore` has them.
+        loop: One of the device's PIDs.
+        options: As in `RobustScore`.
     """
 
     def __init__(self, *args: Any, loop: ClosedLoop, **options: Any) -> None:

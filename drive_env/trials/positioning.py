@@ -1,6 +1,6 @@
-"""The positioning move that trials are made of: planned for a machine, started on drives, and evaluated.
+"""The positioning move of trials: planned for a machine, started on drives, and evaluated.
 
-Every profile takes 60 ms and every trial 250 ms, so that all axes have the same windows, whatever they turn.
+Every profile takes 60 ms and every trial 250 ms, so that all axes have the same windows, whatever their load.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ if TYPE_CHECKING:
 CYCLE = 0.001  # s
 # In communication cycles: the profile, the end of the window in which it settles, and the trial.
 PROFILE, SETTLED, TRIAL = 60, 150, 250
-QUIET = (PROFILE + SETTLED) // 2  # where the ripple is looked at from
+QUIET = (PROFILE + SETTLED) // 2  # first cycle of the window for the ripple
 COUNTED_RAMP = "pps^2"  # unit of ramps in increments per second squared
-WATCH = 25  # how often a trial looks whether the current swings
+WATCH = 25  # cycles between two checks of the current in a trial
 ACCELERATION_SHARE = 0.4  # of the rated torque
-SPEED_SHARE, TRAVEL_SHARE = 0.5, 0.4  # of the rated speed at the profile's peak, of what there is to go
-ABOUT_AS_LONG = 0.9  # of the way backwards: from there on the way forwards is taken
-BAND, BAND_COUNTS = 0.01, 3.0  # of the move, and of the encoder: the larger is what counts as settled
+SPEED_SHARE, TRAVEL_SHARE = 0.5, 0.4  # of the rated speed at the profile's peak, of the room
+ABOUT_AS_LONG = 0.9  # of the room backwards: with at least this much room forwards, the move goes forwards
+BAND, BAND_COUNTS = 0.01, 3.0  # of the move, and of the encoder: the larger one is the settling band
 
 
 class Move(NamedTuple):
-    """A positioning move: 607Ah from rest at 0, its speed and ramp, and the same in SI, each of shape (num_axes,).
+    """A positioning move: 607Ah from rest at 0, its speed and ramp, and its scales, each of shape (num_axes,).
 
-    share: Run current of the move over the rated one, of a stepper that is to be overloaded.
+    share: Run current during the move over the rated one, for a stepper that is to be overloaded.
     """
 
     distance: Integers  # inc, with its sign
@@ -52,14 +52,14 @@ class Move(NamedTuple):
 
     @property
     def least_error(self) -> float:
-        """Integral of |error| in a load step, of an axis that stays half a count away: less cannot be seen [rad s]."""
+        """Integral of |error| in a load step at an error of half a count: the least that can be seen [rad s]."""
         return 0.5 / self.counts * (TRIAL - SETTLED) * CYCLE
 
 
 def highest_ramp(device: Device) -> float:
-    """Return the highest acceleration that a drive takes [inc/s^2], by its dictionary; inf where it counts in rpm.
+    """Return the greatest acceleration that a drive accepts by its dictionary [inc/s^2]; inf if it counts in rpm.
 
-    The controllers of steppers have registers of 16 bits for it; others take more than any motor has.
+    Controllers of steppers have 16-bit registers for it; others accept more than any motor can do.
     """
     key = (cia402.PROFILE_ACCELERATION, 0)
     number, base = split_unit(device.bindings[key].unit)
@@ -75,15 +75,15 @@ def plan_move(
     highest: float = math.inf,
     share: ArrayLike = ACCELERATION_SHARE,
 ) -> Move:
-    """Return a triangular move of 60 ms with 0.4 of the rated torque, or less where speed or travel end before.
+    """Plan a triangular move of 60 ms with 0.4 of the rated torque, or less if speed or travel limit it.
 
     Args:
         motor: The motor.
         inertia: Total inertia at the rotor [kg*m^2], shape (num_axes,).
         scaler: 2058h, increments per revolution.
-        reach: How far the rotor may go, with its sign [rad].
-        highest: Acceleration that the drive takes at most [inc/s^2], see `highest_ramp`.
-        share: Of the rated torque that accelerates, (num_axes,) or one for all.
+        reach: Signed angle that the rotor may turn [rad].
+        highest: Greatest acceleration that the drive accepts [inc/s^2], see `highest_ramp`.
+        share: Share of the rated torque that accelerates, (num_axes,) or one for all.
     """
     J, to = np.asarray(inertia, float), np.asarray(reach, float)
     time = PROFILE * CYCLE
@@ -93,28 +93,28 @@ def plan_move(
     angle = np.minimum(angle, (highest * time**2 / 4.0 - 1.0) / increments)
     angle = np.copysign(np.minimum(angle, TRAVEL_SHARE * np.abs(to)), to)
     distance = np.rint(angle * increments).astype(np.int64)
-    # Rounded up: the profile ends in time.
+    # Rounded up, so that the profile ends in time.
     acceleration = np.ceil(np.maximum(4.0 * np.abs(distance) / time**2, 1.0)).astype(np.int64)
     velocity = np.ceil(2.0 * np.maximum(np.abs(distance), 1) / time).astype(np.int64) + 1
     return Move(distance, velocity, acceleration, increments, motor.encoder_counts / (2.0 * math.pi))
 
 
 def longer_way(low: ArrayLike, high: ArrayLike) -> Floats:
-    """Return how far rotors may turn the longer way, with its sign [rad]; forwards where both ways are about as long.
+    """Return the signed angle that rotors may turn to the side with more room [rad]; forwards if both are similar.
 
-    So axes of a machine that stand somewhere near the middle of their travel go the same way each time: what a joint
-    pushes depends on which way the others of its arm go.
+    So axes of a machine near the middle of their travel always move in the same direction: the load of a joint depends
+    on the directions of the others in its arm.
 
     Args:
-        low: How far they may turn backwards, 0 or less.
-        high: How far forwards.
+        low: Signed angle that they may turn backwards, at most 0.
+        high: Signed angle that they may turn forwards.
     """
     down, up = np.asarray(low, float), np.asarray(high, float)
     return np.where(up >= ABOUT_AS_LONG * -down, up, down)
 
 
 def reach(load: str | Path | Load) -> Floats:
-    """Return how far each rotor of a load may turn from the start, the longer way, with its sign [rad]."""
+    """Return the signed angle that each rotor of a load may turn from the start, to the side with more room [rad]."""
     from mechanics.loads import find_load
     from mechanics.shaft import one, way
 
@@ -123,7 +123,7 @@ def reach(load: str | Path | Load) -> Floats:
 
 
 def power_up(drives: Drives, where: Mask | None = None) -> None:
-    """Take drives from switch on disabled to pp, enabled, in as many milliseconds whatever becomes of them."""
+    """Enable switched-off drives in pp, in a fixed number of milliseconds."""
     motion.select_mode(drives, "pp", where)
     for word in cia402.ENABLING:
         drives.advance(CYCLE)
@@ -138,12 +138,12 @@ def write_profile(drives: Drives, move: Move, where: Mask | None = None) -> None
         (cia402.PROFILE_ACCELERATION, move.acceleration),
         (cia402.PROFILE_DECELERATION, move.acceleration),
     ):
-        # Rounded up, where a drive counts in rpm: the profile ends in time.
+        # Rounded up for drives that count in rpm, so that the profile ends in time.
         drives.write(name, np.ceil(value * per_increment(drives, name)).astype(np.int64), where=where)
 
 
 def start(drives: Drives, target: Integers, where: Mask | None = None) -> None:
-    """Set off for a position [inc]; an axis that is not enabled stays where it is."""
+    """Start a move to a position [inc]; an axis that is not enabled does not move."""
     drives.write(cia402.TARGET_POSITION, target, where=where)
     drives.write(cia402.CONTROLWORD, cia402.ENABLE_OPERATION, where=where)  # bit 4 must rise
     drives.write(cia402.CONTROLWORD, cia402.ENABLE_OPERATION | cia402.NEW_SET_POINT, where=where)
@@ -162,12 +162,12 @@ def move_terms(
 
     Args:
         position: 6064h from the set-point on, one row per ms, shape (SETTLED or more, num_axes).
-        current: Demanded current [A], as long.
+        current: Demanded current [A], same shape.
         move: The move.
         t_0: Four times the sum of the small time constants [s].
-        rated_current: Of the motor, peak i_q [A].
-        target: Where it goes [inc], shape (num_axes,).
-        sign: The direction, 1 or -1.
+        rated_current: Rated current of the motor, peak i_q [A].
+        target: Target [inc], shape (num_axes,).
+        sign: Direction, 1 or -1.
     """
     size = np.maximum(np.abs(move.distance), 1).astype(float)
     width = np.maximum(BAND * size, BAND_COUNTS / move.counts * move.increments)
@@ -179,25 +179,25 @@ def move_terms(
 
 
 def swing(current: Floats, rated_current: float) -> Floats:
-    """Return the largest RMS increment of the current from ms to ms of any 25 ms, over the rated one, (num_axes,).
+    """Return the largest RMS increment of the current from ms to ms in any 25 ms, over the rated one, (num_axes,).
 
     Args:
-        current: Of a move from its start on [A], a whole number of 25 ms, (cycles, num_axes).
-        rated_current: Of the motor, peak i_q [A].
+        current: Current of a move from its start [A], (cycles, num_axes) with a whole number of 25 ms.
+        rated_current: Rated current of the motor, peak i_q [A].
     """
     windows = current.reshape(-1, WATCH, current.shape[1])
     return np.asarray(np.sqrt(np.mean(np.diff(windows, axis=1) ** 2, axis=1)).max(axis=0) / rated_current)
 
 
 def resting_swing(current: Floats, rated_current: float) -> Floats:
-    """Return how the current swings about its trend late in a move (RMS), over the rated one, (num_axes,).
+    """Return the RMS of the current about its trend at the end of a move, over the rated one, (num_axes,).
 
-    The trend is a straight line: what still creeps to its place, as coupled axes do that work against each other, does
-    not swing.
+    The trend is a straight line, so that a slow approach to the target, as of coupled axes that work against each
+    other, does not count.
 
     Args:
-        current: Of a move from its start on, before any load step [A], (SETTLED cycles, num_axes).
-        rated_current: Of the motor, peak i_q [A].
+        current: Current of a move from its start, before any load step [A], (SETTLED cycles, num_axes).
+        rated_current: Rated current of the motor, peak i_q [A].
     """
     late = current[QUIET:SETTLED] - current[QUIET:SETTLED].mean(axis=0)
     time = np.arange(len(late)) - (len(late) - 1) / 2.0
@@ -205,5 +205,5 @@ def resting_swing(current: Floats, rated_current: float) -> Floats:
 
 
 def wrapped(increments: Floats | Integers) -> Floats:
-    """Return differences of positions that wrap at 2^31, as they are."""
+    """Return differences of positions without the wrap of their counter at 2^31."""
     return (np.asarray(increments, float) + 2.0**31) % 2.0**32 - 2.0**31

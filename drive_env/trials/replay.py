@@ -1,6 +1,6 @@
-"""A recorded move of a real machine, repeated on emulated ones: their deviation, and a fit of machines to it.
+"""Repeats a recorded move of a real machine on emulated ones: returns their deviation, and fits machines to the record.
 
-The log is the CSV that `drive-env scope` writes. The commands are played again; the responses are compared.
+The log is the CSV that `drive-env scope` writes. The commands are played again, and the responses compared.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from drive_env.emulator.emulated_drives import EmulatedDrives
 
 
-# What the drive was told, in the order in which it is looked for: object, mode in which it is played, and played as.
-# A position demand comes first: it is what a profile in the drive (pp) made of its target.
+# Commands in the order of search: recorded object, mode in which it is played, and object that plays it.
+# A position demand comes first: the drive's profile (pp) has already turned the target into a path.
 COMMANDS: tuple[tuple[Key, str, Key], ...] = (
     ((cia402.POSITION_DEMAND, 0), "csp", (cia402.TARGET_POSITION, 0)),
     ((cia402.TARGET_POSITION, 0), "csp", (cia402.TARGET_POSITION, 0)),
@@ -43,21 +43,21 @@ RESPONSES: tuple[Key, ...] = (
     (cia402.TORQUE_ACTUAL, 0),
 )  # position, velocity, current
 _POSITIONS: tuple[Key, ...] = ((cia402.POSITION_DEMAND, 0), (cia402.POSITION_ACTUAL, 0), (cia402.TARGET_POSITION, 0))
-MAX_SHIFT = 0.02  # s, the longest time by which a response is looked for earlier or later
-LATEST = 1e7  # s: a stamp of 1e300 has no milliseconds any more
+MAX_SHIFT = 0.02  # s, greatest time shift of a response that is searched
+LATEST = 1e7  # s: at 1e300 a float has no resolution of milliseconds left
 AT_REST = 0.1  # of the range of the speed: noise of a quiet axis
 _COLUMN = re.compile(r"^([0-9A-Fa-f]{4})h:([0-9A-Fa-f]{2}) [^()]*?(?: \[[^]]*\])?(?: \((.+)\))?$")
 
 
 class Log(NamedTuple):
-    """A recorded move: times `t` [s], shape (n,), and each object's integers, shape (n, axes)."""
+    """A recorded move: times `t` [s], shape (n,), and integers of each object, shape (n, axes)."""
 
     t: Floats
     objects: Mapping[Key, Integers]
 
     @property
     def num_axes(self) -> int:
-        """Axes in the log."""
+        """Number of axes in the log."""
         return int(next(iter(self.objects.values())).shape[1])
 
     @property
@@ -67,11 +67,11 @@ class Log(NamedTuple):
 
 
 class LogDifference(NamedTuple):
-    """The deviation of one object of an emulated machine from the log, each of shape (num_machines,).
+    """The deviation of one object of emulated machines from the log, each of shape (num_machines,).
 
-    nrmse: RMS of the difference over the log's range (greatest less least), samples by samples.
-    shift: Time [s] by which the emulator is late: shifted back by it, it fits best.
-    shifted: NRMSE then.
+    nrmse: RMS of the difference over the log's range (greatest less least), sample by sample.
+    shift: Time [s] by which the emulator is late: shifted back by it, the difference is least.
+    shifted: NRMSE with this shift.
     """
 
     nrmse: Floats
@@ -82,11 +82,12 @@ class LogDifference(NamedTuple):
 class LogFit(NamedTuple):
     """Machines that fit a log.
 
-    distributions: The distributions given, those of fitted parameters replaced by the range of the accepted machines.
+    distributions: The given distributions, with fitted parameters replaced by the range of the accepted machines.
     accepted: Fitted parameter -> values of the accepted machines [SI], best first.
     distance: Their distances, mean NRMSE over objects and axes, best first.
-    nominal: Distance of the machine without any draw.
-    narrowed: Fitted parameter -> width of the accepted machines' middle 90 % over that of the law given, in 0...1.
+    nominal: Distance of the nominal machine.
+    narrowed: Fitted parameter -> width of the accepted machines' middle 90 % over that of the given distribution, in
+        0...1.
     """
 
     distributions: Distributions
@@ -100,7 +101,7 @@ class LogFit(NamedTuple):
         return self.narrowed[name] < UNSEEN
 
     def to_toml(self) -> str:
-        """Return the fitted set as `Distributions.load` reads it, with the results of the fit as comments."""
+        """Return the fitted set as TOML for `Distributions.load`, with the results of the fit as comments."""
         lines = [
             "# Fitted to a recorded move: the range of the machines that respond like it, 5th to 95th percentile.",
             f"# Distance (mean NRMSE): nominal machine {self.nominal:.4f}, best {self.distance[0]:.4f}, "
@@ -116,10 +117,10 @@ UNSEEN = 0.8  # share of the range above which a parameter counts as not identif
 
 
 def read_log(path: str | Path) -> Log:
-    """Return the log in a CSV of `drive-env scope`.
+    """Read a log from a CSV of `drive-env scope`.
 
     Raises:
-        ValueError: For an invalid file, with the line.
+        ValueError: For an invalid file; the message names the line.
     """
     file = Path(path)
     if not file.is_file():
@@ -146,7 +147,7 @@ def read_log(path: str | Path) -> Log:
 
 
 def _columns(file: Path, head: list[str]) -> dict[Key, list[int]]:
-    """Return the columns of each object, one for each axis, by the first line of a log."""
+    """Return the columns of each object, one for each axis, from the first line of a log."""
     if len(head) < 2 or head[0] != "t [s]":
         raise ValueError(f"{file}: the first line must begin with 't [s]', as drive-env scope writes it")
     columns: dict[Key, list[int]] = {}
@@ -159,7 +160,7 @@ def _columns(file: Path, head: list[str]) -> dict[Key, list[int]]:
 
 
 def _samples(file: Path, rows: Iterator[list[str]], width: int) -> tuple[Floats, Integers]:
-    """Return times [s] and integers, shape (n, width), of a log's rows; little more memory than these is taken."""
+    """Read times [s] and integers, shape (n, width), from a log's rows, with little more memory than these need."""
     times, values = array("d"), array("q")
     for number, row in enumerate(rows, 2):
         try:
@@ -177,15 +178,15 @@ def _samples(file: Path, rows: Iterator[list[str]], width: int) -> tuple[Floats,
 def replay(drives: EmulatedDrives, log: Log, settings: Mapping[Any, int] | None = None) -> dict[Key, Integers]:
     """Repeat a log's command on every emulated machine, from rest; return the log's objects, (n, num_axes) each.
 
-    Machines are reset first; their parameters stay. Positions begin at the log's first.
+    Machines are reset first, but keep their parameters. Positions begin at the log's first.
 
     Args:
         drives: Emulated drives whose machines have as many axes as the log.
         log: The recorded move.
-        settings: Objects of the real drive (gains, limits): name -> integer; `drive-env parameters backup` has them.
+        settings: Objects of the real drive (gains, limits): name -> integer; `drive-env parameters backup` reads them.
 
     Raises:
-        ValueError: If the log holds no command, or was taken from another number of axes.
+        ValueError: If the log has no command, or another number of axes.
     """
     command, mode, played = command_of(log)
     axes = drives.num_axes // drives.num_machines
@@ -202,7 +203,7 @@ def replay(drives: EmulatedDrives, log: Log, settings: Mapping[Any, int] | None 
         drives.write(played, rows[0])
     motion.enable(drives, mode)
     if command == (cia402.POSITION_DEMAND, 0):
-        # A demand is where the drive had to be in that cycle; a target played in csp is reached a cycle later.
+        # A demand holds for its own cycle; a target played in csp is reached one cycle later.
         rows = np.concatenate([rows[1:], rows[-1:]])
     names = [name for name in RESPONSES if name in log.objects]
     trace = drives.record(names, len(rows) * CYCLE, play={played: rows}, period=log.every * CYCLE)
@@ -211,10 +212,10 @@ def replay(drives: EmulatedDrives, log: Log, settings: Mapping[Any, int] | None 
 
 
 def command_of(log: Log) -> tuple[Key, str, Key]:
-    """Return which object of a log is the command, the mode that plays it, and the object that it is played as.
+    """Return the object of a log that is the command, the mode that plays it, and the object that it is played as.
 
     Raises:
-        ValueError: If it has no such object, naming the possible ones, or begins in the middle of a move.
+        ValueError: If the log has no such object, naming the possible ones, or begins in the middle of a move.
     """
     speed = log.objects.get((cia402.VELOCITY_ACTUAL, 0))
     if speed is not None and np.any(np.abs(speed[0]) > AT_REST * np.maximum(np.ptp(speed, axis=0), 1)):
@@ -227,12 +228,12 @@ def command_of(log: Log) -> tuple[Key, str, Key]:
 
 
 def compare(log: Log, found: Mapping[Key, Integers], num_machines: int = 1) -> dict[Key, LogDifference]:
-    """Return how far replayed objects lie from the log; of several axes the worst counts.
+    """Return the deviation of replayed objects from the log; the worst axis of a machine counts.
 
     Args:
         log: The recorded move.
-        found: As `replay` returns it.
-        num_machines: Machines in it.
+        found: Result of `replay`.
+        num_machines: Number of machines in it.
     """
     report: dict[Key, LogDifference] = {}
     for key, values in found.items():
@@ -247,7 +248,7 @@ def compare(log: Log, found: Mapping[Key, Integers], num_machines: int = 1) -> d
 
 
 def fittable(laws: Distributions) -> list[str]:
-    """Return which parameters of a set of distributions can be fitted: those that are drawn from a range."""
+    """Return the parameters of a set of distributions that can be fitted: those drawn from a range."""
     return [name for name, law in laws.laws.items() if name not in BESIDE and law.law != "choice"]
 
 
@@ -263,26 +264,26 @@ def fit(
     slack: float = 1.2,
     seed: int = 0,
 ) -> LogFit:
-    """Fit distributions to a log: draw machines, keep those that respond like it, draw anew around them, and so on.
+    """Fit distributions to a log: draw machines, keep those with a similar response, draw around them, and repeat.
 
     A population Monte Carlo search without likelihood: every machine of `drives` is a candidate. The first round draws
-    from the distributions given, the later ones from the best of all so far, as many as `accept` of a round, spread by
-    their own covariance. The accepted machines are those within `slack` times the best distance. Their range is not a
-    confidence interval: it is the set of machines that this log cannot tell from the best one by more than that.
+    from the given distributions, later rounds around the best candidates so far, `accept` of a round, spread by their
+    covariance. The accepted machines are those within `slack` times the least distance. Their range is not a confidence
+    interval: it contains the machines that this log cannot distinguish from the best one by more than that.
 
     Args:
-        drives: Emulated drives, at least 16 machines; the more the better.
+        drives: Emulated drives, at least 16 machines; more give a better fit.
         log: The recorded move.
-        distributions: Distributions, or a set's name; what is not fitted stays nominal in the search.
-        parameters: Which of them to fit.
+        distributions: Distributions, or a set's name; parameters that are not fitted stay nominal.
+        parameters: Names of the parameters to fit.
         settings: As in `replay`.
-        rounds: Of candidates, 1 or more.
-        accept: Share of a round's machines: so many of the best the next round is drawn around.
-        slack: Distance of the worst machine that is accepted, over that of the best.
-        seed: Of the search.
+        rounds: Number of rounds, 1 or more.
+        accept: Share of a round's machines around which the next round is drawn.
+        slack: Greatest distance of an accepted machine over the least one.
+        seed: Seed of the search.
 
     Raises:
-        ValueError: For a parameter without a law, or too few machines.
+        ValueError: For a parameter without a distribution, or too few machines.
     """
     laws = Distributions.load(distributions)
     machine = drives.machine
@@ -297,7 +298,7 @@ def fit(
         raise ValueError(f"a fit needs at least 16 machines and one parameter, not {candidates} and {len(parameters)}")
     rng = np.random.default_rng(seed)
     default = {name: float(nominal[name][0]) for name in parameters}
-    # The search is in shares of chance of each law, 0...1: every law has the same shape there.
+    # The search uses quantiles of each distribution, 0...1: there all distributions are uniform.
     tried = np.empty((0, len(parameters)))
     distances = np.empty(0)
     try:
@@ -319,25 +320,25 @@ def fit(
     return _result(laws, parameters, default, tried[order], distances[order], base)
 
 
-# --- inside -----------------------------------------------------------------------------------------------------------
+# --- private functions ------------------------------------------------------------------------------------------------
 def _candidates(
     rng: np.random.Generator, tried: Floats, distances: Floats, count: int, width: int, accept: float
 ) -> Floats:
     if not len(tried):
-        # Stratified: every law's range is covered evenly.
+        # Stratified: the range of every distribution is covered evenly.
         strata = np.stack([rng.permutation(count) for _ in range(width)], axis=1)
         return (strata + rng.random((count, width))) / count
     best = np.argsort(distances, kind="stable")[: max(2 * width, round(accept * count), 4)]
     # Twice the population's covariance, as in Beaumont et al. 2009 (adaptive approximate Bayesian computation).
     spread = 2.0 * np.atleast_2d(np.cov(tried[best], rowvar=False)) + 1e-10 * np.eye(width)
     around = tried[rng.choice(best, count)] + rng.multivariate_normal(np.zeros(width), spread, count)
-    # Reflected at the ends of the laws, so that a parameter at its limit stays reachable.
+    # Reflected at the ends of the distributions, so that a parameter at its limit can be reached.
     folded = np.mod(around, 2.0)
     return np.asarray(np.where(folded > 1.0, 2.0 - folded, folded))
 
 
 def _give(drives: EmulatedDrives, values: Mapping[str, Floats]) -> Mask:
-    """Set parameters; return which machines can have them."""
+    """Set parameters; return the machines for which they are possible."""
     machine, possible = drives.machine, np.ones(drives.num_machines, bool)
     try:
         machine.set_all(values)
@@ -381,7 +382,7 @@ def _result(
 
 
 def _best_shift(want: Floats, have: Floats, span: Floats, period: float) -> tuple[Floats, Floats]:
-    """Return the shift [s] that fits best, to a tenth of a sample, and the NRMSE with it, shape (machines,)."""
+    """Return the shift [s] with the least NRMSE, to a tenth of a sample, and this NRMSE, shape (machines,)."""
     n, machines = len(want), have.shape[1]
     reach = min(max(1, math.floor(MAX_SHIFT / period)), n // 4)
     inner = slice(reach, n - reach)
@@ -398,13 +399,13 @@ def _best_shift(want: Floats, have: Floats, span: Floats, period: float) -> tupl
 
 
 def _is_a_path(values: Integers) -> bool:
-    """Return whether set-points go on from cycle to cycle: the target of a profile jumps."""
+    """Return whether set-points form a path from cycle to cycle; the target of a profile jumps."""
     travel = np.ptp(values, axis=0).max()
     return bool(travel == 0 or np.abs(np.diff(values, axis=0)).max() < 0.5 * travel)
 
 
 def _between(values: Integers, every: int) -> Integers:
-    """Return positions of every cycle from samples of every so many."""
+    """Interpolate positions for every cycle from samples of every few cycles."""
     rows = [np.linspace(a, b, every, endpoint=False) for a, b in pairwise(values)]
     last = np.repeat(values[-1:], every, axis=0)
     return np.asarray(np.rint(np.concatenate([*rows, last])), np.int64)

@@ -1,9 +1,9 @@
-"""Figures of a recorded move: step, disturbance, effort and ringing, of many axes at once.
+"""Figures of a recorded move: step, disturbance, effort and ringing, for many axes at once.
 
 A record is a time vector t [s], shape (n,), and signals of shape (n,) for one axis or (n, num_axes) for many; every
 figure then has shape () or (num_axes,). A figure that does not exist (never rises, never settles) is nan, never an
-exception and never inf. An axis with a sample that is not finite has diverged: all its figures are nan and it counts
-as oscillating; its neighbours are not disturbed. Only an ill-posed question raises ValueError.
+exception and never inf. An axis with a sample that is not finite has diverged: all its figures are nan and it counts as
+oscillating; other axes are not affected. Only invalid arguments raise ValueError.
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mechanics.arrays import Floats, Integers, Mask
 
-ROUNDING = 1e-9  # of the record: t = k * dt may miss a given time by this without costing a sample
+ROUNDING = 1e-9  # of the record: a sample may lie outside a time limit by this, since t = k * dt is rounded
 
 # Oscillation, see `oscillation`; the first three in units of the amplitude to be found.
 SWING = 1.3  # a sine sampled four times per period shows 1.41 to 2 amplitudes from valley to peak
@@ -70,7 +70,7 @@ def step_metrics(
     tail: float = 0.1,
     oscillation_amplitude: float = 0.05,
 ) -> StepMetrics:
-    """Return all figures of a step response between t_step and t_end; up and down are mirror images.
+    """Return all figures of a step response between t_step and t_end; steps up and down are treated alike.
 
     Args:
         t: Sample times [s], strictly increasing, shape (n,).
@@ -140,7 +140,7 @@ def disturbance_metrics(
         band: Half width of the recovery band [fraction of the dip].
 
     Raises:
-        ValueError: As `step_metrics`; there is no step height here.
+        ValueError: As in `step_metrics`, except for the step height.
 
     """
     times, signal = _record(t, y)
@@ -238,18 +238,18 @@ def rms(x: Floats) -> Floats:
 
 
 def oscillation(t: ArrayLike, x: ArrayLike, *, amplitude: ArrayLike) -> tuple[Mask, Floats]:
-    """Return whether x, an error or a current, rings without decaying, and at which frequency [Hz] (nan: it does not).
+    """Return whether x, an error or a current, rings without decaying, and the frequency [Hz], nan without ringing.
 
-    Nothing is detrended: a ramp, an offset or a creeping tail has no reversal. The first fifth of the record is left
-    to the transient, the rest is cut into an early and a late half; the swing of a half is the smaller of its largest
+    Nothing is detrended: a ramp, an offset or a slow settling has no reversal. The first fifth of the record is omitted
+    as a transient, the rest is divided into an early and a late half; the swing of a half is the smaller of its largest
     fall and its largest rise. x rings if
-      1. the late half spans 1.3 amplitudes from valley to peak, with a standard deviation of 0.4 (not noise),
-      2. its swing is at least 0.8 amplitudes and half the early one (not decaying),
-      3. x reverses at least three times in the record, by 1.3 amplitudes each time (not one overshoot).
-    It takes 3.5 periods in the record to be sure: 5 Hz needs 0.7 s, and 0.15 s shows 23 Hz and more; fewer may pass
-    for a transient. At 1 kHz it works up to 450 Hz. A ringing that decays is distinguished from one that does not after
-    2.3 periods with a damping of 0.2 to 0.35, after 4 with 0.1. Noise must stay below 0.2 amplitudes rms. The frequency
-    is the highest line of the Hann spectrum, which takes the samples to be even.
+    1. the late half spans 1.3 amplitudes from valley to peak, with a standard deviation of 0.4 (not noise),
+    2. its swing is at least 0.8 amplitudes and half the early one (not decaying),
+    3. x reverses at least three times in the record, by 1.3 amplitudes each time (not one overshoot).
+    The record needs 3.5 periods for a reliable result: 5 Hz needs 0.7 s, and 0.15 s is enough from 23 Hz; with fewer
+    periods ringing may be mistaken for a transient. At 1 kHz it works up to 450 Hz. Decaying and steady ringing are
+    distinguished after 2.3 periods with a damping of 0.2 to 0.35, after 4 with 0.1. Noise must stay below 0.2
+    amplitudes rms. The frequency is the highest line of the Hann spectrum, for evenly spaced samples.
 
     Args:
         t: Sample times [s] from the step on, strictly increasing, shape (n,).
@@ -268,13 +268,13 @@ def oscillation(t: ArrayLike, x: ArrayLike, *, amplitude: ArrayLike) -> tuple[Ma
     early, late = (_index_at(times, times[0] + share * (times[-1] - times[0])) for share in (TRANSIENT, 0.6))
     diverged = _diverged(columns)
     with np.errstate(over="ignore", invalid="ignore"):
-        # Peak to peak is cheap and bounds the swing from above: most axes of a grid need nothing else.
+        # Peak to peak is cheap and an upper bound of the swing: most axes of a grid need no further test.
         (rings,) = np.nonzero((np.ptp(columns[late:], axis=0) >= SWING * smallest) & ~diverged)
     rings = rings[columns[late:, rings].std(axis=0) >= RMS * smallest[rings]]
     late_swing = _swing(columns[late:, rings])
     lasting = (late_swing >= LATE_SWING * smallest[rings]) & (late_swing >= DECAY * _swing(columns[early:late, rings]))
     rings = rings[lasting]
-    if rings.size:  # the one loop over time; most records can do without
+    if rings.size:  # the only loop over time; most records do not need it
         rings = rings[_reversals(columns[:, rings], SWING * smallest[rings]) >= REVERSALS]
     oscillating, frequency = diverged, np.full(smallest.shape, np.nan)
     if rings.size:
@@ -341,36 +341,35 @@ def _time_to_stay(t: Floats, x: Floats, limit: ArrayLike) -> Floats:
 
 
 def _pick(x: NDArray[Any], k: Integers) -> NDArray[Any]:
-    """Return x[k] per axis."""
     return np.asarray(np.take_along_axis(x, np.asarray(k)[None], axis=0)[0])
 
 
 def _divide(a: Floats, b: Floats) -> Floats:
-    """Return a / b, 0 where b is 0: there the neighbour decides and the quotient is not used."""
+    """Return a / b, 0 if b is 0: then the neighbouring sample decides and the quotient is not used."""
     return np.divide(a, b, out=np.zeros(np.shape(a)), where=np.asarray(b != 0))
 
 
 def _weighted_sum(weights: Floats, x: Floats) -> Floats:
-    """Return sum over samples of weights * x, in the order of the samples.
+    """Return the sum of weights * x over samples, added in the order of the samples.
 
-    A matrix product rounds differently with the number of axes; an axis must have the last digit that it has alone.
+    A matrix product would round differently depending on the number of axes; an axis must give identical results alone.
     """
     return np.asarray(np.cumsum(weights.reshape(-1, *(1,) * (x.ndim - 1)) * x, axis=0)[-1])
 
 
 def _trapezoid_weights(t: Floats) -> Floats:
-    """Return w [s] with w @ x the trapezoid integral of x."""
+    """Return weights w [s] with which w @ x is the trapezoid integral of x."""
     half = np.diff(t) / 2
     return np.asarray(np.append(half, 0.0) + np.append(0.0, half))
 
 
 def _diverged(x: Floats) -> Mask:
-    """Return which axes hold a sample that is not finite."""
+    """Return which axes have a sample that is not finite."""
     return np.asarray(~np.isfinite(x).all(axis=0))
 
 
 def _or_nan(figure: Floats, diverged: Mask) -> Floats:
-    """Return the figure, nan where the axis diverged or the arithmetic overflowed."""
+    """Return the figure, nan if the axis diverged or the arithmetic overflowed."""
     return np.where(diverged | ~np.isfinite(figure), np.nan, figure)
 
 
@@ -406,7 +405,7 @@ def _window(t: Floats, start: float, end: float | None, name: str) -> slice:
 
 
 def _record(t: ArrayLike, y: ArrayLike) -> tuple[Floats, Floats]:
-    """Return t and y as float arrays that fit."""
+    """Convert t and y to float arrays and check that their shapes fit."""
     times, signal = np.asarray(t, dtype=np.float64), _signal(y, "signal")
     if times.ndim != 1 or len(signal) != times.size:
         raise ValueError(

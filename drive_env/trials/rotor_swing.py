@@ -1,14 +1,14 @@
-"""Inertia of an open-loop stepper by the free swing of its rotor in the field, after a quarter of a full step.
+"""Inertia of an open-loop stepper from the free swing of its rotor in the field, after a quarter of a full step.
 
-A ramp of a light load turns the rotor by less in its field than detent torque and friction do, and says nothing of the
-inertia. The free swing does: T_hold is the data sheet's at the current that flows, and
+A ramp of a light load turns the rotor by less in its field than detent torque and friction do, and does not show the
+inertia. The free swing does: with the data sheet's T_hold at the present current,
 
     J d2x/dt2 = T_hold sin(n_p (d - x)) - c dx/dt - T_c sign(dx/dt),   f = sqrt(n_p T_hold / J) / 2 pi for small swings
 
-with d the field and x the rotor. Detent torque adds 4 n_p T_d cos(4 n_p x) to the stiffness: the swing is measured in
-two places half a full step apart, where that has opposite signs, and the mean of both stiffnesses is without it,
-wherever the full steps are. Frequency and dry friction are those whose swing, from the demand that was recorded, is
-nearest to the encoder's.
+with the field's angle d and the rotor's x. Detent torque adds 4 n_p T_d cos(4 n_p x) to the stiffness: the swing is
+measured at two positions half a full step apart, where this term has opposite signs, and cancels in the mean of both
+stiffnesses, independent of the positions of the full steps. Frequency and dry friction are fitted: the swing simulated
+from the recorded demand must match the encoder's.
 """
 
 from __future__ import annotations
@@ -21,31 +21,31 @@ from drive_env.motors import Motor
 from mechanics.arrays import Floats
 
 LENGTH = 100  # samples of a swing, one per ms
-SUBSTEPS = 10  # of the integration, in a ms
-SPACING = 1.03  # from one frequency of the grid to the next
-LEAST_INERTIA, MOST_INERTIA = 0.8, 300.0  # rotors, as `momentum_balance` has them
-STIFFNESS = 2.0  # by how much detent torque raises or lowers the stiffness at most
-FRICTION = (0.01, 0.02, 0.04, 0.07, 0.12)  # of the holding torque
-START = (-1.0, 0.0, 1.0)  # where dry friction had left the rotor before, of how far it can hold it from the field
+SUBSTEPS = 10  # of the integration per ms
+SPACING = 1.03  # ratio of neighbouring frequencies of the grid
+LEAST_INERTIA, MOST_INERTIA = 0.8, 300.0  # rotors, as in `momentum_balance`
+STIFFNESS = 2.0  # greatest factor by which detent torque changes the stiffness
+FRICTION = (0.01, 0.02, 0.04, 0.07, 0.12)  # dry friction over the holding torque
+START = (-1.0, 0.0, 1.0)  # initial angle of the rotor over the largest at which dry friction can hold it
 _PAIRS = np.array([(friction, start) for friction in FRICTION for start in START]).T
-EXPLAINED = 0.85  # of the variance of a swing, that its fit must explain
+EXPLAINED = 0.85  # least share of a swing's variance that a valid fit explains
 
 
 class FreeSwing(NamedTuple):
-    """Results of free swings, (num_axes,) each: the inertia [kg m^2], and the least share of variance explained."""
+    """The results of free swings, (num_axes,) each: the inertia [kg m^2], and the least share of variance explained."""
 
     inertia: Floats
     explained: Floats
 
 
 def inertia_of_swings(demand: Floats, position: Floats, held: Floats, age: float, motor: Motor) -> FreeSwing:
-    """Return the inertia that swings in two places half a full step apart say.
+    """Return the inertia from swings at two positions half a full step apart.
 
     Args:
-        demand: Of the rotor [rad], from the set-point on, a row per ms, (places, samples, num_axes).
-        position: The encoder's, as long.
-        held: Holding torque at the current that flows [N m], (num_axes,).
-        age: How old an encoder's count is [s].
+        demand: Demand for the rotor [rad], from the set-point on, one row per ms, (positions, samples, num_axes).
+        position: Position by the encoder [rad], same shape.
+        held: Holding torque at the present current [N m], (num_axes,).
+        age: Age of an encoder's count [s].
         motor: The motor.
     """
     fits = [_fit(motor, d, x, held, age) for d, x in zip(demand, position, strict=True)]
@@ -63,7 +63,7 @@ def _fit(motor: Motor, demand: Floats, position: Floats, held: Floats, age: floa
     field = motor.n_p * (demand - demand[0])
     seen = motor.n_p * (position - position[0])
     errors = np.stack([_errors(motor, grid, field[:, k], seen[:, k], held[k], age) for k in range(axes)])
-    least = np.min(errors, axis=2)  # over frictions and starts
+    least = np.min(errors, axis=2)  # over frictions and initial angles
     best = np.clip(least.argmin(axis=1), 1, len(grid) - 2)
     each = np.arange(axes)
     before, here, after = (least[each, best + k] for k in (-1, 0, 1))
@@ -74,7 +74,7 @@ def _fit(motor: Motor, demand: Floats, position: Floats, held: Floats, age: floa
 
 
 def _errors(motor: Motor, omega: Floats, field: Floats, seen: Floats, held: float, age: float) -> Floats:
-    """Return the variance of the difference between swings of frequencies and the samples, (omega, _PAIRS)."""
+    """Return the variance of the difference between simulated swings and the samples, (omega, _PAIRS)."""
     dt = 0.001 / SUBSTEPS
     square = omega[:, None] ** 2
     drag = motor.viscous * square / (motor.n_p * held)

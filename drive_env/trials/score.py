@@ -1,34 +1,34 @@
-"""The cost of a tuning: margins that loops must keep, and J of a positioning move and a load step among those that do.
+"""The cost of a tuning: margins that loops must keep, and the cost J of a positioning move and a load step.
 
-Lower is better. The performance J judges every machine on its own scales:
+Lower is better. The performance J scores every machine on its own scales:
 
     J = (t_s/t_0)^0.4 (E_d/E_0)^0.4 (1 + (n/3 %)^2)^0.2 (1 + max(0, os - 2 %)/10 %)
 
-    beyond 15 bent towards 30 (30 - 225/J, which goes on with the same slope); a fault scores 30
+    beyond 15 bent towards 30 (30 - 225/J, with a continuous slope); a fault scores 30
 
     t_s = t_0 + integral of min(1, |e|/w) dt from the profile's end to the load step; w = max(1 % of the move, 3 counts)
-    t_0 = four times t, the sum of the small time constants, or 4.5 times the lag of what hangs on springs where that is
-          more: with most of the inertia on one spring, w_v = 0.45/t is a tenth of the anti-resonance
+    t_0 = four times t, the sum of the small time constants, or 4.5 times the lag of the masses on springs if that is
+        larger: with most of the inertia on one spring, w_v = 0.45/t is a tenth of the anti-resonance
     E_d = integral of |e| dt after a load step of 0.3 rated torque
     E_0 = 132 T t^3 / J, that of a rigid axis with w_v = 0.45/t, T_i = 4/w_v, k_v = w_v/3: T_i T/(J w_v k_v), with the
-          load step's torque T and the inertia J at the rotor; of a machine of several axes the largest of all, since
-          one that the load does not reach would have none
+        load step's torque T and the inertia J at the rotor; for a machine with several axes the largest of all, since
+        it would be 0 for an axis that the load does not reach
     n   = RMS increment of the demanded current from millisecond to millisecond, at rest before the load step, over the
-          rated current; on a bus, and of a drive that does not tell its current's error, that of the actual current
+        rated current; on a bus, and for a drive without an object for the current's error, that of the actual current
     os  = largest way beyond the target over the move
 
-An open-loop stepper has a J of its own (`open_loop.py`). E_0 of steppers is E_d with the gains of the baseline rule.
+An open-loop stepper has its own J (`open_loop.py`). E_0 of steppers is E_d with the gains of the baseline rule.
 
-The *robust performance* is half of J plus half of the largest J of the machine as it is and its variants. It counts
-among gains that keep the constraints: the margins of the dynamics (drive_env/loops/dynamics.py) in every outer loop of
-the true linear machine, weaker ones on its variants, the overshoot of a csp step, no swing at rest. The *robust cost*
-puts whatever keeps them before whatever does not, without a step between:
+The *robust performance* is half of J plus half of the largest J of the nominal machine and its variants. It counts for
+gains that keep the constraints: the margins of the dynamics (drive_env/loops/dynamics.py) in every outer loop of the
+true linear machine, weaker ones on its variants, the overshoot of a csp step, no swing at rest. The *robust cost* ranks
+all gains that keep the constraints before all others, without a jump between them:
 
-    s = least slack of the constraints, relative: 0 where one is just kept
+    s = least slack of the constraints, relative: 0 if one is only just kept
     s > 0: performance^g 30^(1-g), g = 1 - exp(-s / 1 %);  else 30 (2 - exp(s))
 
 A stepper's loops have no linear model here: its robust cost is its robust performance. Both are for scoring and
-training, never something to observe: a load step, and the machine's variants, do not exist on hardware.
+training, not for observation: a load step and variants of the machine are impossible on hardware.
 """
 
 from __future__ import annotations
@@ -76,15 +76,15 @@ if TYPE_CHECKING:
 
 
 TRIP = 30.0
-BENT = TRIP / 2.0  # where J begins to bend towards it
+BENT = TRIP / 2.0  # value from which J is bent
 NOISE, OVERSHOOT_FREE, OVERSHOOT_SCALE = 0.03, 0.02, 0.1
 LOAD_SHARE = 0.3  # of the rated torque
-# Of the lag of what hangs on springs. Of 17 shafts with little damping the best velocity loop had 0.04 to 0.5 of the
-# lag's angular frequency, 0.1 in the median: it is the resonance's peak that ends it.
+# Over the lag of masses on springs. For 17 shafts with little damping the best velocity loop had 0.04 to 0.5 of the
+# lag's angular frequency, 0.1 in the median: the resonance's peak limits it.
 ELASTIC = 0.45 / 0.1
 E_0_SHARE = 4.0 * 3.0 / 0.45**3  # of T t^3 / J
-_NOISE = 7919.0  # between the seeds of the noise of runs that are repeated
-# Parts of the demanded current. What a drive has no object for, it does not tell.
+_NOISE = 7919.0  # between the noise seeds of repeated runs
+# Parts of the demanded current; objects that a drive lacks are left out.
 _DEMANDED: tuple[ObjectName, ...] = (cia402.TORQUE_ACTUAL, Role.TORQUE_ERROR)
 
 _INERTIA = ("body_inertia", "body_mass", "density")  # fields of load parameters that are the load's inertia
@@ -102,7 +102,7 @@ class Variant(NamedTuple):
 
 
 def servo_variants(inertia_range: tuple[float, float] = INERTIA_RANGE) -> tuple[Variant, ...]:
-    """Return the variants of a servo's machine, whose load inertia may become these multiples of its own."""
+    """Return the variants of a servo's machine; the load inertia varies between these factors."""
     low, high = inertia_range
     return (
         Variant("nominal"),
@@ -114,7 +114,7 @@ def servo_variants(inertia_range: tuple[float, float] = INERTIA_RANGE) -> tuple[
 
 
 VARIANTS = servo_variants()
-# A stepper's step rates are near to what its torque allows: twice the inertia is another machine.
+# A stepper's ramps are close to its torque limit: with twice the inertia it would lose steps.
 STEPPER_VARIANTS = (
     Variant("nominal"),
     Variant("load inertia x 1.3", inertia=1.3),
@@ -123,13 +123,13 @@ STEPPER_VARIANTS = (
     Variant("velocity P x 1.5", velocity_p=1.5),
     Variant("run current x 0.8", run_current=0.8),
 )
-RESTING = 0.05  # what the current may swing about its trend at rest (RMS), over the rated one
-TRIPPED = -5.0  # slack of a machine that trips: none is farther from what is asked for
-BORDER = 0.01  # slack beyond which performance is all that counts
+RESTING = 0.05  # greatest RMS of the current about its trend at rest, over the rated one
+TRIPPED = -5.0  # slack of a machine that trips; lower slacks are set to it
+BORDER = 0.01  # slack beyond which only performance counts
 
 
 class Terms(NamedTuple):
-    """The terms of J, each of one shape: t_s/t_0, E_d/E_0, n and os as fractions, and whether there was a fault."""
+    """The terms of J, all of the same shape: t_s/t_0, E_d/E_0, n and os as fractions, and whether there was a fault."""
 
     settling: Floats
     disturbance: Floats
@@ -154,20 +154,20 @@ def cost(terms: Terms) -> Floats:
 
 
 def below_trip(raw: Floats, tripped: Mask) -> Floats:
-    """Return J below the score of a trip, or tripping early would pay, but so that a worse result still costs more."""
+    """Return J: always below the score of a trip, so that an early trip never pays, but still increasing."""
     with np.errstate(divide="ignore"):
         bent = np.where(raw <= BENT, raw, TRIP - BENT**2 / raw)
-    # Not finite: the axis left physics.
+    # Not finite: the axis left the range of physics.
     return np.where(tripped | ~np.isfinite(raw), TRIP, bent)
 
 
 def robust_performance(j: Floats) -> Floats:
-    """Return the robust performance by the variants' J, the nominal machine's first in the last dimension."""
+    """Return the robust performance from the variants' J; the nominal machine's is the first in the last dimension."""
     return np.asarray(0.5 * j[..., 0] + 0.5 * j.max(axis=-1))
 
 
 def robust_cost(performance: Floats, slack: Floats) -> Floats:
-    """Return the robust cost by performance and slack, in their shape; a slack of infinity is of no constraints."""
+    """Return the robust cost from performance and slack, in their shape; an infinite slack means no constraints."""
     inside = 1.0 - np.exp(-np.maximum(slack, 0.0) / BORDER)
     kept = np.minimum(performance, TRIP) ** inside * TRIP ** (1.0 - inside)
     return np.where(slack > 0.0, kept, TRIP * (2.0 - np.exp(np.minimum(slack, 0.0))))
@@ -175,14 +175,16 @@ def robust_cost(performance: Floats, slack: Floats) -> Floats:
 
 # --- the robust cost of emulated machines -----------------------------------------------------------------------------
 class Scores(NamedTuple):
-    """Of every machine: the robust cost (num_machines,), and J and its terms, (num_machines, variants).
+    """The robust cost of every machine, (num_machines,), and J and its terms, (num_machines, variants).
 
-    A machine with several axes is as good as its worst. Of several runs it is the mean of each. performance, slack:
-    What the robust cost is made of, (num_machines,). clearance: Of the outer loops, (num_machines, variants), and
-    overshoot: of a csp step, (num_machines,); nan where there is no linear model. swing: What a trial
-    would measure, the largest RMS increment of the current over 25 ms until the load step, over the rated one,
-    likewise, and the largest of several runs; J does not count it. rest: How the current swings about its trend before
-    the load step (RMS), over the rated one, likewise, and the RMS over several runs; neither does J count that.
+    The worst axis of a machine counts; several runs are averaged.
+    performance, slack: The parts of the robust cost, (num_machines,).
+    clearance: Of the outer loops, (num_machines, variants); nan without a linear model.
+    overshoot: Of a csp step, (num_machines,); nan without a linear model.
+    swing: As a trial measures it: the largest RMS increment of the current over 25 ms until the load step, over the
+        rated one, and the largest of several runs, (num_machines, variants); it is not part of J.
+    rest: RMS of the current about its trend before the load step, over the rated one, and the RMS over several runs,
+        (num_machines, variants); it is not part of J.
     """
 
     robust_cost: Floats
@@ -197,9 +199,10 @@ class Scores(NamedTuple):
 
 
 class CurrentSwings(NamedTuple):
-    """How currents swing, over the rated one, each of shape (machines, runs, axes); nan where no current is measured.
+    """The swings of currents, over the rated one, each of shape (machines, runs, axes); nan if no current is measured.
 
-    moving: The largest RMS increment over 25 ms until the load step. resting: RMS about its trend before it.
+    moving: The largest RMS increment over 25 ms until the load step.
+    resting: RMS about the trend before the load step.
     """
 
     moving: Floats
@@ -207,24 +210,24 @@ class CurrentSwings(NamedTuple):
 
 
 class RobustScore(Saved):
-    """Scores gains on emulated machines: every variant of every machine is a machine of one set, run side by side.
+    """Scores gains on emulated machines: all variants of all machines are simulated side by side.
 
-    The score depends on the machine and the gains alone: every run begins at rest, with the same noise. A variant
-    without effect on this load (a stiffness where nothing is elastic) is left out.
+    The score depends on the machine and the gains only: every run begins at rest, with the same noise. A variant
+    without effect on this load (stiffness of a rigid load) is left out.
 
-    With one run of each variant, what is scored is partly the noise and the place: an axis that stands between two
-    counts of its encoder may hunt where it rests in the middle of one. `repeats` runs of each, every one with a noise
-    of its own and to a place of its own within a count, and the mean of their scores, say what gains are worth.
+    With one run of each variant, the score depends on noise and position: an axis between two counts of its encoder may
+    oscillate where it would rest in the middle of a count. `repeats` runs, each with its own noise and position within
+    a count, give a mean score that describes the gains.
 
     Args:
         device: Name of the device.
         load: The load.
-        motor: The motor, by name, by the path of its file, or as it is.
-        num_machines: Machines to be scored.
-        num_threads: Threads that run them; the number of cores by default.
+        motor: The motor: its name, the path of its file, or the motor itself.
+        num_machines: Number of machines to score.
+        num_threads: Number of threads; the number of cores by default.
         friction: Model of the load's friction, as in EmulatedDrives.
         repeats: Runs of every variant of every machine, whose scores are averaged.
-        dynamics: What the loops must keep.
+        dynamics: Requirements on the loops.
     """
 
     STATE = ("_drives", "_t_0", "_reference", "_move", "_loops", "_constant")
@@ -260,21 +263,22 @@ class RobustScore(Saved):
             and (variant.run_current == 1.0 or by_current)
         )
         self.num_machines, self.repeats = num_machines, repeats
-        self._runs = repeats * len(self.variants)  # of a machine
-        # Half the inertia behind a nut or a flank resonates faster than the physics' step allows the machine as it is.
+        self._runs = repeats * len(self.variants)  # per machine
+        # Variants with half the inertia behind a nut or a flank resonate too fast for the physics' step of the nominal
+        # machine.
         faster = self._has_loops and "contact_stiffness" in fields
         self._drives: EmulatedDrives = EmulatedDrives(
             device, found, motor, num_machines * self._runs, distinct=1, num_threads=num_threads,
             friction=friction, physics_steps=2 if faster else 1,
         )  # fmt: skip
-        if repeats > 1:  # the first noise is that of a score without repeats, and the variants of a run share it
+        if repeats > 1:  # the first noise is that of a score without repeats, and all variants of a run share it
             seeds = np.tile(np.repeat(_NOISE * np.arange(1.0, repeats + 1.0), len(self.variants)), num_machines)
             later = np.tile(np.repeat(np.arange(repeats) > 0, len(self.variants)), num_machines)
             self._drives.machine.seed_noise(seeds, later)
         packed = one(found)
         self._ways = way(packed).joints
         levers = np.abs(self._ways @ packed.plant.disturbance[:, 0])
-        # Against the move, as a load that lies in the way does.
+        # Against the move, like an obstructing load.
         self._load_torque = -LOAD_SHARE * self._drives.motor.rated_torque / float(levers.max())
         self._pushed = LOAD_SHARE * self._drives.motor.rated_torque * levers / levers.max()  # torque at each rotor
         self._constant: Floats = np.zeros(num_machines * self._runs)
@@ -282,7 +286,7 @@ class RobustScore(Saved):
         factors = np.tile([v.velocity_p * v.run_current for v in self.variants], repeats)
         self._factors = np.tile(np.repeat(factors, axes[2]), axes[0])
         self._axes = axes
-        # Where within a count of the encoder a run ends, as shares of it.
+        # Position within a count of the encoder at which a run ends, as a share of the count.
         self._place = np.repeat(np.tile(np.arange(self._runs) // len(self.variants), num_machines), axes[2]) / repeats
         self._t_0 = np.ones(self._drives.num_axes)
         self._reference = np.ones((axes[0], axes[2]))  # E_0 [rad s]
@@ -290,13 +294,13 @@ class RobustScore(Saved):
         self._move = plan_move(self._drives.motor, zero + self._drives.motor.inertia, 1.0, zero)
 
     def set_machines(self, parameters: Mapping[str, Floats], supply: Floats, where: Mask | None = None) -> None:
-        """Take the machines to score, shape (num_machines,): `drives.machine.parameters` and supply voltage."""
+        """Set the machines to score, (num_machines,): values of `drives.machine.parameters`, and supply voltage."""
         variants = self._runs
         mask = np.ones(self.num_machines, bool) if where is None else where
         kind = {f"load.{p.name}": p.field for p in self._drives.load.parameters}
         inertia = np.tile([v.inertia for v in self.variants], self.num_machines * self.repeats)
         stiffness = np.tile([v.stiffness for v in self.variants], self.num_machines * self.repeats)
-        # Its own drives know how their motors are wired; how they were wired elsewhere changes nothing of the gains.
+        # The wiring of motors is left out: the drives here are set for their own, and it does not affect the gains.
         values = {name: np.repeat(value, variants) for name, value in parameters.items() if name not in WIRING}
         for name, field in kind.items():
             if field in _INERTIA:
@@ -309,7 +313,7 @@ class RobustScore(Saved):
         machine.supply = np.where(np.repeat(each, self._axes[2]), volts, machine.supply)
         filters = machine.parameters["stage.velocity_filter"]
         self._t_0 = np.repeat(self._settling_scale(filters), self._axes[2])
-        machine.reset()  # each run begins where the load starts: there its inertia counts, and it is linearised
+        machine.reset()  # each run begins at the load's first position, where it is linearised
         if self._has_loops:
             lags = elastic_lags(self._drives).reshape(self._axes)[:, :1]
             self._t_0 = np.maximum(self._t_0, 4.0 * np.broadcast_to(ELASTIC * lags, self._axes).reshape(-1))
@@ -321,7 +325,7 @@ class RobustScore(Saved):
         self._constant = np.repeat(np.asarray(torque, float), self._runs)
 
     def set_moves(self, move: Move, where: Mask | None = None) -> None:
-        """Take the move of every axis of the machines, shape (num_machines * axes,)."""
+        """Set the move of every axis of the machines, shape (num_machines * axes,)."""
         lanes = np.ones(self.num_machines, bool) if where is None else where
         each = np.repeat(lanes, self._runs * self._axes[2])
         old = self._move
@@ -334,7 +338,7 @@ class RobustScore(Saved):
         )
 
     def score_rule(self, gains: Integers, where: Mask | None = None) -> Scores:
-        """Return the scores of the baseline rule's gains, of which a stepper's machines `where` take their E_0."""
+        """Return the scores of the baseline rule's gains, from which a stepper's machines `where` get their E_0."""
         return self.score(gains)
 
     def score(self, gains: Integers) -> Scores:
@@ -354,19 +358,19 @@ class RobustScore(Saved):
         )
 
     def loop_slack(self, gains: Integers, *, nominal: bool = False) -> Floats:
-        """Return by how much the loops of machines keep the margins and the overshoot, relative, (num_machines,).
+        """Return the relative slack of machines' loops to margins and overshoot, (num_machines,).
 
         Args:
             gains: Raw integers, (num_machines * axes, count).
-            nominal: Whether to look at the machines as they are alone, not at their variants.
+            nominal: Judge the nominal machines without their variants.
         """
         clearance, overshoot = self._clearance(gains, 1 if nominal else len(self.variants))
         return self.dynamics.slack(clearance[:, 0], clearance[:, 1:], overshoot)
 
     def _clearance(self, gains: Integers, variants: int) -> tuple[Floats, Floats]:
-        """Return the clearance of machines' first variants, (machines, variants), and overshoots, (machines,)."""
+        """Return the clearance of the machines' first variants, (machines, variants), and overshoots, (machines,)."""
         machines, runs, axes = self._axes
-        # The variants of the first run are those of all.
+        # The variants of the first run; those of other runs are equal.
         chosen = np.arange(machines * runs) % runs < variants
         device = self._drives.device
         raw = device.gains.with_velocity_p(self._spread(np.asarray(gains, np.int64)), self._factors)
@@ -382,7 +386,7 @@ class RobustScore(Saved):
 
     @staticmethod
     def _tries_current(is_open_loop: bool) -> bool:
-        """Return whether a variant has less run current, in place of more gain."""
+        """Return whether a variant has less run current instead of more gain."""
         return is_open_loop
 
     def _settling_scale(self, filters: Floats) -> Floats:
@@ -390,7 +394,7 @@ class RobustScore(Saved):
         return 4.0 * small_time_constants(self._drives.device, filters)
 
     def _disturbance_scale(self) -> Floats:
-        """Return E_0 of the machines where they stand [rad s], (num_machines, axes)."""
+        """Return E_0 of the machines at their present position [rad s], (num_machines, axes)."""
         lag = 0.25 * self._t_0.reshape(self._axes)[:, 0]
         mass = np.concatenate([group.load.mass_matrix() for group in self._drives.inside.groups])[:: self._runs]
         inertia = np.einsum("ad,cde,ae->ca", self._ways, mass, self._ways)
@@ -398,7 +402,7 @@ class RobustScore(Saved):
         return np.repeat(found[:, None], self._axes[2], axis=1)
 
     def _spread(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Return values of (num_machines * axes,) for the axes of all variants."""
+        """Repeat values of (num_machines * axes,) for all variants and runs."""
         machines, runs, axes = self._axes
         shape = (machines, 1, axes, *values.shape[1:])
         full = (machines, runs, axes, *values.shape[1:])
@@ -431,7 +435,7 @@ class RobustScore(Saved):
             seen = CurrentSwings(np.full(shape, np.nan), np.full(shape, np.nan))
         return terms.each(lambda value: value.reshape(shape)), np.maximum(error, move.least_error).reshape(shape), seen
 
-    # What kinds of drives differ in.
+    # Overridden for other kinds of drives.
     _cost: Callable[[Any], Floats] = staticmethod(cost)
 
     def _objects(self) -> list[ObjectName]:
@@ -441,18 +445,18 @@ class RobustScore(Saved):
         return [cia402.POSITION_ACTUAL, *demanded, cia402.STATUSWORD]
 
     def _varied(self, gains: Integers) -> Integers:
-        """Return the gains of all axes of all variants with what the variants change of them."""
+        """Return the gains of all axes of all variants, as changed by the variants."""
         return self._drives.device.gains.with_velocity_p(gains, self._factors)
 
     def _get_ready(self) -> tuple[Integers, Mask]:
-        """Enable the drives at rest; return where they go [inc], and which axes cannot be scored."""
+        """Enable the drives at rest; return their targets [inc], and axes that cannot be scored."""
         move = self._move
         power_up(self._drives)
         place = np.rint(self._place * move.increments / move.counts).astype(np.int64)
         return move.distance + place, np.zeros(self._drives.num_axes, bool)
 
     def _load_step(self, objects: list[ObjectName]) -> Mapping[Any, Integers]:
-        """Load the machines until the trial ends, and record them."""
+        """Apply the load step until the trial ends, and record the machines."""
         self._drives.machine.load_torque = self._constant + self._load_torque
         trace = self._drives.record(objects, (TRIAL - SETTLED) * CYCLE)
         return {name: trace[name] for name in objects}
@@ -460,7 +464,7 @@ class RobustScore(Saved):
     def _terms(
         self, free: Mapping[Any, Integers], loaded: Mapping[Any, Integers], target: Integers, used: Integers
     ) -> Any:
-        """Return the terms of every axis by what was recorded before and after the load step, with E_d/E_0 1."""
+        """Return the terms of every axis from the records before and after the load step; E_d/E_0 is set to 1."""
         drives, move = self._drives, self._move
         current = sum(free[name] for name in self._objects()[1:-1]) * ampere_per_count(drives)
         settling, noise, overshoot = move_terms(
@@ -474,7 +478,7 @@ class RobustScore(Saved):
         return self._averaged(terms, self._cost(terms), swings)
 
     def _averaged(self, terms: Any, j: Floats, swings: CurrentSwings) -> Scores:
-        """Return the scores by terms, J and swings of every axis in all runs, (machines, runs, axes)."""
+        """Return the scores from terms, J and swings of every axis in all runs, (machines, runs, axes)."""
         worst = j.argmax(axis=-1)[..., None]
         of_worst = terms.each(lambda value: np.take_along_axis(value, worst, -1)[..., 0])
         shape = (self.num_machines, self.repeats, len(self.variants))
@@ -491,10 +495,10 @@ class RobustScore(Saved):
 
 
 class StepperScore(RobustScore):
-    """As `RobustScore`, of steppers: no loop gives E_0, so it is E_d with the baseline rule's gains."""
+    """`RobustScore` for steppers: without loops there is no E_0, so E_d with the baseline rule's gains is used."""
 
     def score_rule(self, gains: Integers, where: Mask | None = None) -> Scores:
-        """Take the baseline rule's gains for E_0 of the machines `where`; return their scores, with E_d/E_0 1."""
+        """Set E_0 of the machines `where` by the baseline rule's gains; return their scores, with E_d/E_0 of 1."""
         mask = np.ones(self.num_machines, bool) if where is None else where
         measured = self._run(gains)
         nominal = measured[1][:, :: len(self.variants)].mean(axis=1)
@@ -509,11 +513,11 @@ class StepperScore(RobustScore):
 
 
 def swings(current: Floats, rated_current: float, shape: tuple[int, ...]) -> CurrentSwings:
-    """Return how the measured current of runs swings, of the given shape.
+    """Return the swings of runs' measured current, in the given shape.
 
     Args:
-        current: Until the load step [A], (SETTLED cycles, axes of all machines).
-        rated_current: Of the motor, peak i_q [A].
+        current: Current until the load step [A], (SETTLED cycles, axes of all machines).
+        rated_current: Rated current of the motor, peak i_q [A].
         shape: Machines, runs, axes.
     """
     found = (swing(current, rated_current), resting_swing(current, rated_current))

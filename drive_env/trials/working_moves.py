@@ -1,8 +1,8 @@
-"""Moves at the working speed, there and back, with load reading and load angle of their steady parts.
+"""Moves at the working speed in both directions, with load reading and load angle of their steady parts.
 
-Load readings are read by SDO, some milliseconds apart: drives of steppers do not map them into process data. How long
-that takes is not known in real time, so that where an axis is in its profile follows from its demand. An axis that
-loses steps is stopped with the next sample, and stays out.
+Load readings are read by SDO, some milliseconds apart, since stepper drives cannot map them to process data. The
+duration of a read in real time is unknown, so the demand shows where an axis is in its profile. An axis that loses
+steps is stopped at the next sample, and takes no further part.
 """
 
 from __future__ import annotations
@@ -23,18 +23,20 @@ from drive_env.trials.positioning import CYCLE, Move, wrapped, write_profile
 from mechanics.arrays import Floats, Integers, Mask
 
 SAMPLE = 4 * CYCLE  # s between two samples
-SETTLE = 0.06  # s after the ramp, until the rotor's swing has died away
-STEADY, LEAST_STEADY = 0.3, 0.06  # s at constant speed: wanted, and at least
+SETTLE = 0.06  # s after the ramp, until the rotor's swing has decayed
+STEADY, LEAST_STEADY = 0.3, 0.06  # s at constant speed: wanted, and least
 LEAST_STEPS = 20.0  # full steps at constant speed
 REST = 0.1  # s at the end of a move
-LATE = 0.02  # s: a load reading that is read by SDO in real time may be so much later than its sample
+LATE = 0.02  # s, greatest delay of a load reading by SDO after its sample in real time
 
 
 class Steady(NamedTuple):
-    """The steady parts of moves there and back, of shape (num_axes,); nan where there were no samples.
+    """The steady parts of moves in both directions, each of shape (num_axes,); nan without samples.
 
-    reading, lowest, spread: Mean, lowest and standard deviation of the load reading. angle, settled: Mean load angle
-    against the motion, electrical [rad], and that of the last quarter. lost: Steps were lost. stopped: In fault.
+    reading, lowest, spread: Mean, lowest value and standard deviation of the load reading.
+    angle, settled: Mean load angle against the motion, electrical [rad], and that of the last quarter.
+    lost: Steps were lost.
+    stopped: The drive went into fault.
     """
 
     reading: Floats
@@ -47,7 +49,7 @@ class Steady(NamedTuple):
 
     @property
     def failed(self) -> Mask:
-        """Which axes did not make it there and back."""
+        """Axes that did not complete the moves."""
         return self.lost | self.stopped
 
 
@@ -57,13 +59,13 @@ class WorkingMoves:
 
     Attributes:
         drives: The drives, enabled by trials.
-        motor: Of every axis.
-        trials: What keeps count of lost steps.
-        origin: Where the axes began [inc].
-        reach: How far they may go, with the sign [rad].
+        motor: Motor of every axis.
+        trials: Compensates for lost steps.
+        origin: First positions of the axes [inc].
+        reach: Signed angle that they may turn [rad].
         acceleration: Of the ramps [rad/s^2].
-        increments: Of a radian.
-        age: Of an encoder's count that is read [s].
+        increments: Increments per radian.
+        age: Age of an encoder's count when it is read [s].
     """
 
     drives: Drives
@@ -76,12 +78,12 @@ class WorkingMoves:
     age: float
 
     def steady_time(self, speed: float) -> Floats:
-        """Return how long the axes can go at a speed within their reach [s], (num_axes,)."""
+        """Return how long the axes can move at a speed within their reach [s], (num_axes,)."""
         ramps = speed**2 / self.acceleration + speed * SETTLE
         return np.asarray(np.minimum((np.abs(self.reach) - ramps) / speed, STEADY))
 
     def least_reach(self, speed: float) -> Floats:
-        """Return how far the axes must go for a speed to be measured at [rad]."""
+        """Return the angle that the axes need to measure at a speed [rad]."""
         steady = max(LEAST_STEADY, LEAST_STEPS * 2.0 * math.pi / (TOOTH * self.motor.n_p) / speed)
         return np.asarray(speed**2 / self.acceleration + speed * (SETTLE + steady))
 
@@ -93,13 +95,14 @@ class WorkingMoves:
         *,
         until_stopped: bool = False,
     ) -> Steady:
-        """Go there and back at a speed [rad/s].
+        """Move in both directions at a speed [rad/s].
 
         Args:
             speed: The speed.
             where: Axes that move.
-            look: Called with 0 on the way out, 1 on the way back, and the time since it began, at each sample.
-            until_stopped: End once no axis goes on.
+            look: Called at each sample with 0 on the way out or 1 on the way back, and the time since its beginning
+                [s].
+            until_stopped: End the move when no axis moves any more.
         """
         count = len(where)
         steady = np.maximum(self.steady_time(speed), LEAST_STEADY)
@@ -129,7 +132,7 @@ class WorkingMoves:
                 lag = wrapped(demand - actual - shift)
                 enabled = cia402.matches(self.drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED)
                 stopped |= where & ~enabled
-                # An axis that its drive has stopped leaves its demand, and has lost no step by that.
+                # An axis that was stopped by its drive is behind its demand without having lost steps.
                 out = where & ~lost & ~stopped & (np.abs(lag) > LOST * full_step)
                 if out.any():
                     self.drives.write(cia402.CONTROLWORD, cia402.ENABLE_OPERATION | cia402.HALT, where=out)
@@ -149,7 +152,7 @@ class WorkingMoves:
         return _steady(readings, angles, lost, stopped)
 
     def _sample(self) -> tuple[Integers, Integers]:
-        """Let time pass, and return demand and encoder of one moment [inc], (num_axes,)."""
+        """Let time pass, and return demand and encoder at the same time [inc], (num_axes,)."""
         if self.drives.time_waits:
             self.drives.advance(SAMPLE)
             return self.drives.read(cia402.POSITION_DEMAND), self.drives.read(cia402.POSITION_ACTUAL)
@@ -157,7 +160,7 @@ class WorkingMoves:
         return trace[cia402.POSITION_DEMAND][-1], trace[cia402.POSITION_ACTUAL][-1]
 
     def _time(self, gone: Integers, speed: float, ramp: Floats) -> Floats:
-        """Return when a demand that has gone so far [inc] is there [s], of a profile whose ramps take `ramp` [s]."""
+        """Return the time [s] at which a profile's demand has covered a way [inc]; its ramps take `ramp` [s]."""
         way = np.abs(wrapped(gone)) / self.increments
         return np.asarray(np.where(way < 0.5 * speed * ramp, 0.0, way / speed + 0.5 * ramp))
 

@@ -1,6 +1,6 @@
-"""What all stages of auto work on: the drives, their drive time, and a journal of each axis.
+"""The data that all stages of auto share: the drives, their drive time, and a journal of each axis.
 
-It is all of a run that changes; what a stage finds it hands on to the next (stages.py).
+Only this bench changes during a run; the stages hand on immutable results (stages.py).
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ if TYPE_CHECKING:
     from tuning.auto.proving import ProvingGround
     from tuning.target import DriveTime, Target
 
-# Drive time of the parts [s]: a frequency response of an axis; a trial, with what recovery takes; a move for the
-# record; and one from where a response has ended.
+# Drive time of the parts [s]: a frequency response of an axis; a trial with recovery; a recorded move; and a recorded
+# move that begins where a response has ended.
 RESPONSE_TIME, TRIAL_TIME, MOVE_TIME, LOOK_BACK_TIME = 2.3, 0.85, 0.8, 1.3
 
-REDESIGNED = "gains designed again from what was measured: "  # how the note on them begins
+REDESIGNED = "gains designed again from what was measured: "  # first words of the note on such gains
 
 
 class Journal:
-    """The remarks about one axis; none is taken back.
+    """The remarks on one axis; they are only added, never removed.
 
     Attributes:
-        reason: Why it stopped; "" while it goes on.
-        reservations: Checks that could not be made or are near a limit; with any of them the certificate is not a plain
-            accept.
+        reason: Why the axis was taken out of the run; "" while it takes part.
+        reservations: Checks that were impossible or are close to a limit; with any of them the certificate says
+            "accepted with reservations".
         notes: Further remarks.
-        corrections: Gains that gave way to others.
+        corrections: Replaced gains.
     """
 
     def __init__(self) -> None:
@@ -50,7 +50,7 @@ class Journal:
         self.corrections: list[Correction] = []
 
     def stop(self, reason: str) -> None:
-        """Take the axis out of the run; its first reason counts."""
+        """Take the axis out of the run; the first reason stays."""
         self.reason = self.reason or reason
 
     def note(self, text: str) -> None:
@@ -62,12 +62,12 @@ class Journal:
         self.reservations.append(text)
 
     def correct(self, old: Integers, new: Integers, reason: str, outcome: str = TAKEN) -> None:
-        """Add that gains, raw, (count,), gave way to others, unless they are the same."""
+        """Record that gains, raw, shape (count,), were replaced; nothing if both are equal."""
         if not np.array_equal(old, new):
             self.corrections.append(Correction(tuple(map(int, old)), tuple(map(int, new)), reason, outcome))
 
     def undo(self, new: Integers, old: Integers, outcome: str) -> None:
-        """Say why gains designed again last, raw, (count,), gave way to others, unless they are the same."""
+        """Record why the last redesigned gains, raw, shape (count,), were taken back; nothing if both are equal."""
         last = self.corrections[-1] if self.corrections else None
         if last is None or last.outcome != TAKEN or np.array_equal(new, old):
             return
@@ -82,19 +82,18 @@ class AutoBench:
     """The drives of one run of auto; each stage takes out the axes that fail in it.
 
     Args:
-        target: What is tuned; its time is counted.
-        clock: That counts the target's time.
-        budget: Most time that may pass on the drives [s].
-        dynamics: What the loops must keep.
+        target: The target to tune, with counted time.
+        clock: Clock of the target's time.
+        budget: Greatest drive time per axis of a machine [s].
+        dynamics: Requirements on the loops.
 
     Attributes:
-        journals: The remarks about each axis.
-        before: Raw gains of the drives before the run, (num_axes, count).
-        modes: 6060h as the drives came, (num_axes,).
-        ground: Where gains are tried; there is none before.
+        journals: The remarks on each axis.
+        before: Raw gains of the drives before the run, shape (num_axes, count).
+        modes: 6060h before the run, shape (num_axes,).
+        ground: Runs the trials; set by the stage "try".
         response_time: Drive time of a frequency response of all axes of a machine [s].
-        spent: Of each axis, what passed while it took part [s]: axes that are through wait for others at no cost of
-            their own.
+        spent: Drive time of each axis [s]: time passed while it took part. Waiting for other axes does not count.
     """
 
     ground: ProvingGround
@@ -106,25 +105,25 @@ class AutoBench:
         self.journals = tuple(Journal() for _ in range(target.num_axes))
         self.before: Integers = read_gains(drives)
         self.modes: Integers = drives.read(cia402.MODE)
-        # Axes of one machine are shaken one after the other.
+        # Axes of one machine are excited one after the other.
         self.response_time = RESPONSE_TIME * target.axes_per_machine
         self.spent: Floats = np.zeros(target.num_axes)
         self._origin = drives.read(cia402.POSITION_ACTUAL)
-        # What one axis has, its machine's others have too: they are shaken one after the other.
+        # The budget is that of the whole machine: its axes are excited one after the other.
         self._clock, self._budget = clock, budget * target.axes_per_machine
 
     @property
     def going(self) -> Mask:
-        """Which axes nothing has stopped, nor another axis of their machine, (num_axes,)."""
+        """Axes of machines none of whose axes was taken out of the run, shape (num_axes,)."""
         return self.whole_machines(np.array([not journal.reason for journal in self.journals]))
 
     def whole_machines(self, where: Mask) -> Mask:
-        """Return the axes of machines all of whose axes are chosen, (num_axes,)."""
+        """Return the axes of machines all of whose axes are chosen, shape (num_axes,)."""
         axes = self.target.axes_per_machine
         return np.asarray(np.repeat(where.reshape(-1, axes).all(axis=1), axes))
 
     def stop(self, where: Mask, reason: str) -> None:
-        """Take axes out of the run; the first reason of an axis counts."""
+        """Take axes out of the run; the first reason of an axis stays."""
         for axis in np.flatnonzero(where):
             self.journals[axis].stop(reason)
 
@@ -139,20 +138,20 @@ class AutoBench:
             self.journals[axis].reserve(text)
 
     def room(self) -> tuple[Floats, Floats]:
-        """Return how far the rotors may turn from where they are now [rad], down and up, each (num_axes,)."""
+        """Return the signed angles that the rotors may still turn [rad], down and up, each shape (num_axes,)."""
         return self.target.travel_left(self._origin)
 
     def wire(self, values: Sequence[Mapping[Key, int]]) -> None:
-        """Write the settings that wirings need, of every axis; travel and origin become those that are counted then."""
+        """Write the wiring settings of every axis, and convert travel and origin to the positions that they give."""
         self.target, self._origin = write_wiring(self.target, self._origin, values)
 
     def affordable(self, seconds: float | Floats) -> Mask:
-        """Return which axes have this much drive time left, (num_axes,)."""
+        """Return which axes have this much drive time left, shape (num_axes,)."""
         return np.asarray(self.spent + seconds <= self._budget)
 
     @contextmanager
     def spending(self, where: Mask) -> Iterator[None]:
-        """Count the time that passes as drive time of some axes."""
+        """Count the time of the block as drive time of some axes."""
         before = self._clock.seconds
         try:
             yield
@@ -160,24 +159,24 @@ class AutoBench:
             self.spent[where] += self._clock.seconds - before
 
     def faults(self) -> dict[int, str]:
-        """Return the axes that went into fault while they took part, and which faults."""
+        """Return axes in the run that went into fault, by number, with their faults as text."""
         drives = self.target.drives
         faulted = self.going & cia402.matches(drives.read(cia402.STATUSWORD), cia402.FAULT_BIT)
         causes = stop_causes(drives)
         return {axis: causes[axis] for axis in map(int, np.flatnonzero(faulted))}
 
     def recover(self, where: Mask) -> None:
-        """Reset faults of axes, and hold them with gains known to be stable."""
+        """Reset faults of axes, and hold them with stable gains."""
         with self.spending(self.target.together(where)):
             self.ground.recover(where)
 
     def recover_faults(self, faults: Mapping[int, str], meanwhile: str) -> None:
-        """Reset faults of axes; one that stays in its fault is taken out of the run, with the reason."""
+        """Reset faults of axes; take an axis out of the run, with the reason, if its fault cannot be reset."""
         if faults:
             self.recover(np.isin(np.arange(self.target.num_axes), list(faults)))
             self.drop_faults(f"{meanwhile}, and the fault cannot be reset")
 
     def drop_faults(self, meanwhile: str) -> None:
-        """Take axes that went into fault out of the run, with the reason."""
+        """Take axes in fault out of the run, with the reason."""
         for axis, causes in self.faults().items():
             self.journals[axis].stop(f"the drive went into fault while {meanwhile}: {causes}")

@@ -1,4 +1,4 @@
-"""The result of auto as a certificate."""
+"""Converts the result of auto to a certificate."""
 
 from __future__ import annotations
 
@@ -42,11 +42,11 @@ if TYPE_CHECKING:
     from tuning.auto.result import AxisResult, Result
     from tuning.target import Target
 
-# Of a loop whose margins are not known: its lines are shown as what they are.
+# Margins of a loop that was not measured.
 UNKNOWN = Margins(*(np.nan,) * len(Margins._fields))
-MODEL_LOW, MODEL_HIGH, MODEL_POINTS = 2.0, 1000.0, 200  # frequencies of a loop that is a model's alone [Hz]
-SETTLED = 0.01  # of the move: the band of settling
-# Counted from the end of the profile.
+MODEL_LOW, MODEL_HIGH, MODEL_POINTS = 2.0, 1000.0, 200  # [Hz], frequencies for a loop known only by its model
+SETTLED = 0.01  # of the move: settling band
+# Measured from the end of the profile.
 SETTLING = "settling time after the set-point's arrival, to within 1 % of the move [s]"
 
 
@@ -54,9 +54,9 @@ def certificate(target: Target, result: Result, seed: int, tuner: str = "auto") 
     """Return the certificate of a run of auto.
 
     Args:
-        target: The drives that were tuned.
-        result: What came of it.
-        seed: That of the run.
+        target: The tuned drives.
+        result: Result of the run.
+        seed: Seed of the run.
         tuner: Name of the tuner that found the gains.
     """
     axes = tuple(_axis(target, result, axis, outcome) for axis, outcome in enumerate(result.axes))
@@ -100,7 +100,7 @@ def _axis(target: Target, result: Result, axis: int, outcome: AxisResult) -> Axi
 
 
 def requirements(dynamics: Dynamics, outcome: AxisResult, gains: GainSet) -> tuple[Requirement, ...]:
-    """Return the requirements of dynamics on an axis, and whether its gains were measured to keep each."""
+    """Return the requirements of dynamics on an axis, and whether the measurement proves that its gains keep each."""
     rows = []
     for loop in LOOPS:
         found, least = outcome.margins.get(loop, UNKNOWN), outcome.at_least.get(loop)
@@ -109,7 +109,7 @@ def requirements(dynamics: Dynamics, outcome: AxisResult, gains: GainSet) -> tup
             value, bound = getattr(found, asked.field), getattr(least, asked.field, np.nan)
             is_bound = not np.isfinite(value) and not np.isnan(bound)
             kept = _kept(asked, value)
-            if is_bound and not asked.missed(bound):  # a lower one says nothing: the margin itself may be above it
+            if is_bound and not asked.missed(bound):  # a bound below the limit proves nothing: the margin may be larger
                 kept = KEPT
             elif kept != NOT_MEASURED and asked.field == "ms" and not whole:
                 kept = SEEN_KEPT if kept != NOT_KEPT else kept
@@ -129,7 +129,7 @@ def _kept(asked: AskedMargin, value: float) -> str:
 
 
 def _crossovers(target: Target, outcome: AxisResult) -> dict[str, float]:
-    """Return where the loops cross over, the current loop by its design and the outer loops as measured."""
+    """Return the crossovers of the loops: of the current loop by its design, of the outer loops as measured."""
     known, plant, current = target.device.gains, outcome.plant, np.nan
     if plant is not None and not known.opens(outcome.after, "current"):
         f = np.geomspace(MODEL_LOW, 0.49 * target.device.current_rate, MODEL_POINTS)
@@ -139,13 +139,13 @@ def _crossovers(target: Target, outcome: AxisResult) -> dict[str, float]:
 
 
 def recorded_moves(result: Result, axis: int) -> tuple[StepResponse, ...]:
-    """Return the move with the gains before, if it was made, and that with the new ones."""
+    """Return the move with the gains before, if it was recorded, and that with the new ones."""
     moves = ((False, result.earlier), (True, result.shown))
     return tuple(_step(shown, axis, tuned) for tuned, shown in moves if shown is not None and shown.where[axis])
 
 
 def _step(shown: Shown, axis: int, tuned: bool) -> StepResponse:
-    # From where the axis began, and in the direction in which it went: moves go there and back.
+    # Relative to the beginning and in the direction of the move: moves go there and back.
     way = 1.0 if shown.demand[-1, axis] >= shown.demand[0, axis] else -1.0
     demand, actual = (way * values[:, axis] for values in (shown.demand, shown.actual))
     size = max(float(np.abs(demand - demand[0]).max()), 1e-9)
@@ -154,7 +154,7 @@ def _step(shown: Shown, axis: int, tuned: bool) -> StepResponse:
     there = np.flatnonzero(demand != demand[-1])
     settled = len(actual) - 1 not in late
     figures = {
-        # Of an actual position that is inside the band before the profile's end, 0.
+        # 0 for an actual position that is in the band before the profile's end.
         SETTLING: max(float(shown.t[late[-1]] - shown.t[there[-1]]), 0.0) if settled and late.size else np.nan,
         "overshoot [%]": 100.0 * max(float(beyond.max()), 0.0) / size,
         "largest following error [rad]": float(np.abs(demand - actual).max()),
@@ -167,11 +167,11 @@ def _step(shown: Shown, axis: int, tuned: bool) -> StepResponse:
 
 
 def _responses(target: Target, result: Result, axis: int, outcome: AxisResult) -> tuple[FrequencyResponse, ...]:
-    """Return both outer loops: measured with the new gains, or by the model, and computed with the gains before."""
+    """Return both outer loops: with the new gains as measured, else by the model; with those before as computed."""
     response, coherence, plant = result.response, None, outcome.plant
     names = [name for name in LOOPS if name in outcome.margins or name in outcome.at_least]
     if response is not None and np.isfinite(response.open_loop[:, axis]).any():
-        # Of the position loop there may be too few coherent lines, and of linked axes it is another.
+        # The position loop may have too few coherent lines; that of linked axes is a different one.
         names = ["velocity", *(name for name in names if name != "velocity")]
         f, coherence = response.f, response.coherence[:, axis]
         measured = response.loops(outcome.after, axis, plant=plant, refined=False)
@@ -182,7 +182,7 @@ def _responses(target: Target, result: Result, axis: int, outcome: AxisResult) -
             + (", with other gains, converted to the new gains by the linear model" if changed else ""),
             "position": "computed from the measured velocity loop and position P",
         }
-    else:  # their margins are bounds
+    else:  # without a response: their margins are bounds
         names = [name for name in names if name in outcome.at_least and plant is not None]
         f = np.geomspace(MODEL_LOW, MODEL_HIGH, MODEL_POINTS)
         loops = {name: OPEN_LOOPS[name](target.device, plant, outcome.after, f) for name in names if plant is not None}
@@ -202,7 +202,7 @@ def _responses(target: Target, result: Result, axis: int, outcome: AxisResult) -
 
 
 def _before(target: Target, outcome: AxisResult, name: str, f: Floats) -> list[FrequencyResponse]:
-    """Return a loop with the gains before, by the linear model; nothing where these are kept or leave a loop open."""
+    """Return a loop with the gains before by the model; empty if these gains were kept or leave a loop open."""
     known, plant = target.device.gains, outcome.plant
     if plant is None or outcome.is_kept or known.opens(outcome.before, "current", "velocity", name):
         return []

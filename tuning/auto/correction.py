@@ -1,4 +1,4 @@
-"""The drive corrects the design: gains are verified, and designed again from what was measured, at most twice."""
+"""Verifies gains on the drives, and designs them again from the measurements, at most twice."""
 
 from __future__ import annotations
 
@@ -29,19 +29,20 @@ if TYPE_CHECKING:
 CORRECTIONS = 2
 UNSEEN = "no loop was measured, so soft dynamics are asked of the model"
 NO_BETTER = "no better as measured: the old ones stay"
-WORTH = 0.85  # of the robust cost on the twins: what is better by less is not worth a correction
-# Velocity P passes the encoder's noise and counts on to the current, whose swing goes about with its square: what it is
-# lowered to where an axis does not rest; position P likewise where a step overshoots.
+WORTH = 0.85  # of the robust cost on the twins: a smaller improvement is not worth a correction
+# Velocity P amplifies noise and resolution of the encoder to the current, whose ripple grows with about its square:
+# factor limits of velocity P of an axis that is not at rest, and of position P if a step overshoots.
 CALMER, LEAST_CALMER = 0.9, 0.5
-# Factors of velocity P, velocity I and position P among which gains are lowered where nothing is computed meanwhile.
+# Factors of velocity P, velocity I and position P for lowered gains, if no time is left to design new ones.
 LOWERED = np.array([(v, i, p) for v in (1.0, 0.85, 0.7, 0.55, 0.4, 0.25) for i in (1.0, 0.7, 0.5, 0.3)
                     for p in (1.0, 0.85, 0.7, 0.55, 0.4, 0.25, 0.15)])  # fmt: skip
 
 
 def _most_velocity_p(bench: AutoBench, best: RecordedGains | None, recorded: RecordedGains) -> Floats:
-    """Return the greatest velocity P of axes, less than the present where they do not rest, else infinite.
+    """Return the greatest allowed velocity P of axes: below the present one for axes not at rest, else infinite.
 
-    Halfway to gains that rest, where these are known: what shakes in the play of a gear is no noise.
+    Half way (geometrically) to gains with which the axis rests, if known: an oscillation in the backlash of a gear is
+    no noise.
     """
     known = bench.target.device.gains
     present = recorded.gains[:, cascade_columns(bench.target.device)[2]]
@@ -63,23 +64,23 @@ def correct(
     *,
     improves: bool = True,
 ) -> RecordedGains:
-    """Verify gains by a move, a frequency response and a load step, and correct the design by what these show.
+    """Verify gains by a move, a frequency response and a load step, and correct the design by their results.
 
     Args:
         bench: The drives.
-        basis: What was identified.
-        tried: The gains, and what their trials showed.
-        target: The drives, whose time is not counted.
-        say: Called with the present step and the share done.
-        improves: Whether gains that keep the dynamics give way to others that cost less on the digital twins.
+        basis: The identified axes.
+        tried: The gains, and the results of their trials.
+        target: The drives with time that is not counted.
+        say: Called with the present step and the share of the run that is done.
+        improves: Whether gains that keep the dynamics are replaced by others that cost less on the digital twins.
 
     Returns:
-        The best of what was verified; an axis whose gains cannot stay is out of the run.
+        The best of the verified gains; axes whose gains failed are taken out of the run.
     """
     recorded, changed = tried, bench.going
     best: RecordedGains | None = None
     tried_before: list[Integers] = []
-    most = tried.most  # velocity P, by whatever did not rest or was stopped, kept or not
+    most = tried.most  # greatest velocity P, lowered by gains that did not rest or were stopped
     for number in range(CORRECTIONS + 1):
         if changed.any():
             say("verifying gains on the drives", 0.72 + 0.08 * number)
@@ -88,9 +89,9 @@ def correct(
             recorded = load(bench, basis, recorded, target, changed)
             most = np.where(changed, np.minimum(most, _most_velocity_p(bench, best, recorded)), most)
             if best is not None:
-                # What is no better than what it was to correct goes.
+                # Corrected gains that are no better than the ones before them are taken back.
                 no_better = bench.whole_machines(_cost(bench, best) <= _cost(bench, recorded))
-                # Nothing is known of the loops of either: those designed for more margin stay.
+                # If neither loop could be measured, the gains designed for more margin stay.
                 no_better &= ~bench.whole_machines(
                     (recorded.failed == "") & np.isnan(best.slack) & np.isnan(recorded.slack)
                 )
@@ -106,7 +107,7 @@ def correct(
         for k in map(int, np.flatnonzero(bench.going)):
             if any(np.array_equal(gains[k], rows[k]) for rows in tried_before):
                 gains[k] = recorded.gains[k]
-        # All axes of machines some of whose axes get other gains.
+        # Change all axes of a machine if one of them gets other gains.
         changed = bench.going & ~bench.whole_machines((gains == recorded.gains).all(axis=1))
         changed &= bench.affordable(TRIAL_TIME + MOVE_TIME + bench.response_time)
         if not changed.any():
@@ -124,8 +125,8 @@ def correct(
 
 
 def _cost(bench: AutoBench, recorded: RecordedGains) -> Floats:
-    """Return the cost of verified gains by J and margins, of each machine its worst axis, (num_axes,)."""
-    # What was not measured is worth less than what is known to keep the dynamics.
+    """Return the cost of verified gains by J and margins, for each machine that of its worst axis, (num_axes,)."""
+    # Gains that were not measured count as worse than gains measured to keep the dynamics.
     slack = np.where(np.isnan(recorded.slack), 0.0, recorded.slack) + MEASURED
     slack = np.fmin(slack, 1.0 - np.minimum(recorded.overshoot - OVERSHOOT_ERROR, 1.0) / bench.dynamics.overshoot)
     cost = robust_cost(np.nan_to_num(recorded.proof, nan=TRIP), slack)
@@ -137,17 +138,17 @@ def _cost(bench: AutoBench, recorded: RecordedGains) -> Floats:
 def _corrected(
     bench: AutoBench, basis: Basis, recorded: RecordedGains, most: Floats, worth: float
 ) -> tuple[Integers, list[str]]:
-    """Return corrected gains, (num_axes, count), and why; the present ones of axes that need no correction."""
+    """Return corrected gains, (num_axes, count), and why; axes that need no correction keep theirs."""
     known, why = bench.target.device.gains, [""] * bench.target.num_axes
     gains = recorded.gains.copy()
     if not bench.target.drives.time_waits:
-        # Twins take longer than an enabled axis may be left alone.
+        # The design on twins takes longer than an enabled axis may be left alone in real time.
         for k in map(int, np.flatnonzero(bench.going)):
             why[k] = _short(bench, recorded, k)
             if why[k]:
                 gains[k] = _lowered(bench, basis, recorded, k, float(most[k]))
         return gains, why
-    # Of machines that failed their move no loop was looked at yet; one looked at and not seen asks for more margin.
+    # Loops were not measured on machines that failed their move; axes whose measurement failed get more margin.
     looked_at = bench.going & bench.whole_machines(recorded.failed == "")
     blind = looked_at & np.array([measured_axis(bench, basis, recorded, k) is None for k in range(len(gains))])
     if not worth and not blind.any() and not any(_short(bench, recorded, int(k)) for k in np.flatnonzero(bench.going)):
@@ -165,7 +166,7 @@ def _corrected(
         shoots_over = recorded.overshoot[k] > bench.dynamics.overshoot
         unlike = blind[k] and not np.array_equal(designed[k], recorded.gains[k])
         if shoots_over and not (recorded.failed[k] or recorded.slack[k] < 0.0 or unlike):
-            # Nothing but the step tells of what makes it overshoot: position P gives way first.
+            # Only the step shows the cause of its overshoot: position P is lowered first.
             share = np.clip(CALMER * bench.dynamics.overshoot / recorded.overshoot[k], LEAST_CALMER, CALMER)
             gains[k] = known.scaled(gains[k], float(share), [cascade_columns(bench.target.device)[4]])
         elif why[k]:
@@ -174,7 +175,7 @@ def _corrected(
 
 
 def _short(bench: AutoBench, recorded: RecordedGains, k: int) -> str:
-    """Return which requirement the gains of an axis miss; "" if they meet all."""
+    """Return which requirement the gains of an axis fail; "" if they keep all."""
     if recorded.failed[k]:
         return str(recorded.failed[k])
     if recorded.slack[k] < 0.0:
@@ -185,7 +186,7 @@ def _short(bench: AutoBench, recorded: RecordedGains, k: int) -> str:
 
 
 def _lowered(bench: AutoBench, basis: Basis, recorded: RecordedGains, k: int, most: float) -> Integers:
-    """Return lowered outer gains of an axis: the liveliest whose measured loops keep the dynamics."""
+    """Return lowered outer gains of an axis: the fastest whose measured loops keep the dynamics."""
     device, measured = bench.target.device, measured_axis(bench, basis, recorded, k)
     _, _, velocity_p, velocity_i, position_p = cascade_columns(device)
     outer = [velocity_p, velocity_i, position_p]
@@ -201,7 +202,7 @@ def _lowered(bench: AutoBench, basis: Basis, recorded: RecordedGains, k: int, mo
 def _try(
     bench: AutoBench, recorded: RecordedGains, gains: Integers, where: Mask, why: Sequence[str]
 ) -> tuple[RecordedGains, Mask, Mask]:
-    """Try corrected gains; return the record with those that passed, the axes that have them, and those stopped."""
+    """Try corrected gains; return the record with those that passed, the axes that have them, and stopped axes."""
     try:
         with bench.spending(bench.target.together(where)):
             proof = bench.ground.run(gains, where)

@@ -1,9 +1,10 @@
-"""Design of an axis's gains: the best performance among the gains that keep the constraints, by its digital twin.
+"""Design of an axis' gains: the best performance among the gains that keep the constraints, on its digital twin.
 
-Nothing is drawn: the gains of the current loop come from the winding and its lags, those of the outer loops from a grid
-in the units of the axis (bandwidth over lags, integration time and position gain over bandwidth). Margins of the whole
-grid are computed on the twin as a linear machine; the performance of the promising few is measured on the twin as an
-emulated machine, with friction, noise and counts; and what is best there is looked around.
+The design has no random part: the gains of the current loop follow from the winding and its lags, those of the outer
+loops from a grid in units of the axis (bandwidth times lags, integration time and position gain over bandwidth). The
+margins of the whole grid are computed on the twin as a linear machine; the performance of the most promising gains is
+measured on the twin as an emulated machine, with friction, noise and encoder resolution; then the neighbours of the
+best are searched.
 """
 
 from __future__ import annotations
@@ -39,23 +40,24 @@ if TYPE_CHECKING:
     from tuning.target import Target
 
 # The grid of the outer loops: bandwidth of the velocity loop times the small lags, integration time times the
-# bandwidth, position gain over the bandwidth; and the shares of the greatest torque P.
+# bandwidth,
+# position gain over the bandwidth; and torque P over its greatest value.
 BANDWIDTHS = np.geomspace(0.01, 1.2, 20)
 INTEGRATIONS = (0.8, 1.1, 1.5, 2.0, 3.0, 4.5, 7.0, 12.0)
 POSITIONS = (0.08, 0.12, 0.18, 0.25, 0.33, 0.42, 0.55, 0.75, 1.0)
 TORQUES = (1.0, 0.6, 0.36)
-LEAST_TORQUE = 0.3  # below it the current loop is a low-pass of the velocity loop, which no engineer signs
+LEAST_TORQUE = 0.3  # below it the current loop is a low-pass in the velocity loop, which no engineer accepts
 # The current loop: its crossover times its own lag, one and a half periods; 60 degrees of phase margin.
 CURRENT_CROSSOVER, CURRENT_LAG = 0.52, 1.5
-# Of every bandwidth and torque P: whose variants are looked at, and that are tried on the twin. A slow current loop
-# promises nothing by itself, but passes on less of what an encoder's counts make of the velocity.
+# For each bandwidth and torque P: the number of gains whose variants are computed, and of those tried on the twin. A
+# slow current loop has no better promise, but passes less of the encoder's quantisation noise.
 EACH_NOMINAL, EACH = 8, 2
-FINALISTS = 12  # that are tried on all worlds
-STEPS = (1.4, 1.25, 1.18, 1.1, 1.06)  # by which what is best is looked around, gain by gain, up and down
-PROMISING = 32  # of those, that are tried
-FED_FORWARD = np.array([0.3, 0.5, 0.7, 0.85, 1.0])  # of the highest feed-forward: what is tried with the best gains
-SETS, RUNS = 32, 3  # of gains at once on the twins, and runs of each on all worlds
-STILL_FRICTION = WORLDS[1].friction  # over what was identified, of an axis that did not rest
+FINALISTS = 12  # number of gains tried in all variants of the machine
+STEPS = (1.4, 1.25, 1.18, 1.1, 1.06)  # factors to the neighbours of the best gains, gain by gain, up and down
+PROMISING = 32  # number of neighbours that are tried
+FED_FORWARD = np.array([0.3, 0.5, 0.7, 0.85, 1.0])  # of the greatest feed-forward: values tried with the best gains
+SETS, RUNS = 32, 3  # sets of gains at once on the twins, and runs of each in all variants
+STILL_FRICTION = WORLDS[1].friction  # over the identified one, for an axis that was not at rest
 
 
 def design_axes(
@@ -67,16 +69,16 @@ def design_axes(
     dynamics: Dynamics | None = None,
     most: Floats | None = None,
 ) -> tuple[Integers, Floats, Floats]:
-    """Return the best gains of axes by their twins, (num_axes, count), and the robust cost of these and of the present.
+    """Design gains of axes on their twins: (num_axes, count), their robust cost, and that of the present gains.
 
     Args:
         bench: The drives.
-        basis: What was identified.
-        where: Axes, (num_axes,); the others have gains of 1.
-        say: Called with the share done.
-        recorded: The present gains, and what was measured with them; nothing by default.
-        dynamics: What the loops must keep; those of the run by default.
-        most: The greatest velocity P that an axis may have, raw, (num_axes,); infinite by default.
+        basis: The identified axes.
+        where: Axes to design, (num_axes,); the others get gains of 1.
+        say: Called with the share that is done.
+        recorded: The present gains and their measurements; None without any.
+        dynamics: Requirements on the loops; those of the run by default.
+        most: Greatest raw velocity P of each axis, (num_axes,); infinite by default.
     """
     target, axes = bench.target, np.flatnonzero(where).tolist()
     gains, cost, present = np.ones_like(bench.before), *np.full((2, target.num_axes), np.nan)
@@ -84,7 +86,7 @@ def design_axes(
         return gains, cost, present
     known = [_known(bench, basis, recorded, k) for k in axes]
     scaler = np.asarray(target.drives.read(Role.POSITION_SCALE), float)[axes]
-    # The response of a linked axis was measured without the other one; what both say is in their model.
+    # The response of a linked axis was measured with the other one off; the model combines both.
     measured = [None if recorded is None or target.linked else measured_axis(bench, basis, recorded, k) for k in axes]
     models = [
         (model, np.searchsorted(axes, of))
@@ -104,14 +106,15 @@ def design_axes(
 
 
 def _known(bench: AutoBench, basis: Basis, recorded: RecordedGains | None, k: int) -> Known:
-    """Return the data of an axis's twin: as identified, and as its response was fitted where it was measured.
+    """Return the data of an axis' twin: as identified, or as its response was fitted if that was measured.
 
-    What holds an axis still that did not rest is less than what moves told, in which drag passes for dry friction.
+    For an axis that was not at rest the dry friction is reduced: moves overestimate it, since drag looks like dry
+    friction.
     """
     plant, found = basis.identified.known(k)
     reach = float(basis.trial_reach(bench)[k])
     if bench.target.linked:
-        # The ends of one part move it together, each its share, and then nothing twists.
+        # The ends of one rigid part move it together, each its share, without twisting it.
         rigid = replace(plant, anti_resonance=math.inf, resonance=math.inf)
         return known_of(rigid, found, reach)
     plant, found = fitted_plant(bench.target, basis.identified, recorded, k)
@@ -123,7 +126,7 @@ def _known(bench: AutoBench, basis: Basis, recorded: RecordedGains | None, k: in
 def _as_rigid(
     target: Target, known: Sequence[Known], measured: Sequence[MeasuredAxis | LinkedAxis | None], dynamics: Dynamics
 ) -> list[tuple[LoopModel, Integers]]:
-    """Return rigid models of elastic axes that could not be measured: the play of a gear looks like a soft spring."""
+    """Return rigid models of elastic axes that were not measured: backlash looks like a soft spring in moves."""
     rigid = [replace(one.plant, anti_resonance=math.inf, resonance=math.inf) for one in known]
     return [
         (model_of(target.device, target.motor, rigid[n], dynamics), np.array([n]))
@@ -133,14 +136,14 @@ def _as_rigid(
 
 
 class Judge(NamedTuple):
-    """Judges sets of gains of n axes: on their twins, by their linear models, and by their loops as measured.
+    """Judges sets of gains of n axes: on their twins, by their linear models, and by their measured loops.
 
-    A machine whose axes are coupled is one: all its axes get the worst of each other's cost, and the same slack.
+    All axes of a machine whose axes are coupled get the worst cost and the worst slack among them.
 
     Attributes:
-        twins: What they cost.
-        models: Of each machine its linear model, and which of the n axes it has, (axes,).
-        measured: The loops of each axis as they were measured, None where they were not.
+        twins: The twins.
+        models: Linear model of each machine, and which of the n axes it has, (axes,).
+        measured: The measured loops of each axis, None if they were not measured.
     """
 
     twins: Twins
@@ -148,7 +151,7 @@ class Judge(NamedTuple):
     measured: Sequence[MeasuredAxis | LinkedAxis | None]
 
     def slack(self, gains: Integers, *, nominal: bool = False) -> Floats:
-        """Return how far they keep the constraints of the loops, relative; `nominal` of the axes as they are alone."""
+        """Return the relative slack of gains to the constraints; with `nominal` without the variants of the machine."""
         slack = np.full(gains.shape[:2], np.inf)
         for k, one in enumerate(self.measured):
             if one is not None:
@@ -164,7 +167,7 @@ class Judge(NamedTuple):
         return self.of_machines(robust_cost(performance, np.minimum(slack, self.slack(gains))), np.max)
 
     def of_machines(self, values: Floats, reduce: Callable[..., Floats]) -> Floats:
-        """Return values of axes, (n, sets), with what their machine makes of them."""
+        """Replace the values of axes, (n, sets), by their machine's, reduced over its axes."""
         whole = values.copy()
         for _, axes in self.models:
             whole[axes] = reduce(values[axes], axis=0)
@@ -172,10 +175,11 @@ class Judge(NamedTuple):
 
 
 class Designed(NamedTuple):
-    """What a design found, of every axis, the best first.
+    """The designed gains of every axis, the best first.
 
-    gains: Raw, (n, found, count). cost: Robust cost on the twins, (n, found). slack: How far the constraints are kept,
-    relative, likewise; below 0 where no gains keep them.
+    gains: Raw, (n, found, count).
+    cost: Robust cost on the twins, (n, found).
+    slack: Relative slack to the constraints, (n, found); below 0 if no gains keep them.
     """
 
     gains: Integers
@@ -190,14 +194,14 @@ def design(
     say: Callable[[float], None] = lambda share: None,
     most_velocity_p: Floats | None = None,
 ) -> Designed:
-    """Return the best gains of axes.
+    """Design gains of axes by judges.
 
     Args:
         coarse: Judges the axes as identified, with one run of each set.
-        fine: The same axes on all worlds, with several.
-        plants: The axes, as many as these have.
-        say: Called with the share done; what it raises ends the design.
-        most_velocity_p: The greatest velocity P, raw, (n,); infinite by default.
+        fine: Judges the same axes in all variants of the machine, with several runs.
+        plants: The axes, in the order of the judges.
+        say: Called with the share that is done; an exception from it ends the design.
+        most_velocity_p: Greatest velocity P, raw, (n,); infinite by default.
     """
     device, n = coarse.twins.device, coarse.twins.num_axes
 
@@ -209,7 +213,7 @@ def design(
     pool = np.array([_grid(device, plant, TORQUES) for plant in plants])
     torque_p = pool[..., cascade_columns(device)[0]].max(axis=1)
     pool[..., column] = np.minimum(pool[..., column], most[:, None])
-    # The best by promise of each bandwidth: first of what keeps the margins as it is, then with its variants.
+    # The most promising gains of each bandwidth: first those that keep the nominal margins, then with the variants.
     for each, nominal in ((EACH_NOMINAL, True), (EACH, False)):
         rows = _of_each(coarse.slack(pool, nominal=nominal), promise(pool), each, len(BANDWIDTHS) * len(TORQUES))
         pool = np.take_along_axis(pool, rows[:, :, None], axis=1)
@@ -241,17 +245,17 @@ def design(
 def design_by_loops(
     device: Device, plant: Plant, slack: Callable[[Integers, bool], Floats], most_velocity_p: float
 ) -> tuple[Integers, float]:
-    """Return the most promising gains that keep the constraints of the loops, (count,), and how far they keep them.
+    """Return the most promising gains that keep the constraints of the loops, (count,), and their slack.
 
-    It takes seconds, since no twin is run: friction and noise are not looked at, and the current loop has the crossover
-    that its lags allow.
+    It takes seconds, since no twin runs: friction and noise are ignored, and the current loop has the crossover that
+    its lags allow.
 
     Args:
         device: The drive.
         plant: The axis.
-        slack: Returns how far raw gains, (sets, count), keep the constraints, (sets,); given whether to look at the
-            axis as it is alone.
-        most_velocity_p: The greatest velocity P, raw.
+        slack: Returns the slack of raw gains, (sets, count), to the constraints, (sets,); its second argument selects
+            the nominal axis without variants.
+        most_velocity_p: Greatest velocity P, raw.
     """
     column = cascade_columns(device)[2]
 
@@ -270,13 +274,13 @@ def design_by_loops(
 
 
 def _best(device: Device, gains: Integers, slack: Floats) -> tuple[Integers, float]:
-    """Return the most promising of gains that keep the constraints, else those that come nearest, and their slack."""
+    """Return the most promising gains that keep the constraints, else those with the most slack, and their slack."""
     best = int(np.argmin(np.where(slack > 0.0, _promise(device, gains), 1e9 - slack)))
     return gains[best], float(slack[best])
 
 
 def _grid(device: Device, plant: Plant, torques: Sequence[float]) -> Integers:
-    """Return the gains of the grid for an axis, raw, (sets, count); bandwidths change slowest."""
+    """Return the raw gains of the grid for an axis, (sets, count); bandwidth varies slowest."""
     scales = si_scales(device, plant.supply)
     lag = CURRENT_LAG / device.current_rate
     small = float(small_time_constants(device, plant.velocity_filter)) + plant.delay - 1.0 / device.velocity_rate
@@ -300,17 +304,17 @@ def _whole(device: Device, rows: Floats | Integers) -> Integers:
 
 
 def _promise(device: Device, gains: Integers) -> Floats:
-    """Return ln J of gains without noise and resonances, over 0.4 and up to a constant, (n, sets): less is better.
+    """Estimate ln J without noise and resonances, over 0.4 and up to a constant, (n, sets); smaller is better.
 
-    Their product is what a load step leaves, and what dry friction leaves of a move.
+    The product of the gains determines the error that a load step and dry friction leave.
     """
     return np.asarray(-np.log(device.gains.strength(gains, cascade_columns(device)[2:])).sum(axis=-1))
 
 
 def _of_each(slack: Floats, promise: Floats, each: int, count: int) -> Integers:
-    """Return the most promising of every bandwidth and torque P, `count` of these, that keep the constraints.
+    """Return the most promising gains of each of `count` pairs of bandwidth and torque P that keep the constraints.
 
-    Where they are fewer, those that come nearest to keeping them. Of shape (n, count * each).
+    If too few do, those with the most slack follow. Indices of shape (n, count * each).
     """
     n, sets = slack.shape
     group = (n, count, sets // count)
@@ -320,7 +324,7 @@ def _of_each(slack: Floats, promise: Floats, each: int, count: int) -> Integers:
 
 
 def _around(device: Device, gains: Integers, step: float, most_torque_p: int) -> Integers:
-    """Return gains around some, (sets, count): all outer gains and torque P up and down by a factor."""
+    """Return the neighbours of gains, (sets, count): all outer gains and torque P, up and down by a factor."""
     torque_p, _, velocity_p, velocity_i, position_p = cascade_columns(device)
     factors = np.array(list(product((1.0 / step, 1.0, step), repeat=4)))
     rows = device.gains.scaled(gains, factors, [torque_p, velocity_p, velocity_i, position_p])

@@ -1,4 +1,4 @@
-"""The axes as identified, and what their design begins with: models, calm gains, whether gains before are safe."""
+"""Identifies the axes, and prepares their design: models, calm gains, and whether the gains before are safe."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ if TYPE_CHECKING:
     from tuning.auto.bench import AutoBench
     from tuning.identify.identified_axis import Identification
 
-Identify = Callable[[Target, Mask], "list[Identification]"]  # of the axes where the mask is true
+Identify = Callable[[Target, Mask], "list[Identification]"]  # identifies the axes where the mask is true
 
-# The calmest gains: of the current loop, and shares of the velocity loop of `cautious_gains` and of this one's own.
+# The calm gains: bandwidth of the current loop; shares of `cautious_gains`' velocity loop, and of the calm one's.
 CALM_CURRENT_HZ, ROTOR_SHARE, POSITION_SHARE = 800.0, 0.6, 0.4
-SAFE_GAIN_DB, SAFE_PHASE = 6.0, 25.0  # margins by the model, from which on gains are moved with
-LOOKED_AT = 400  # frequencies of the model
+SAFE_GAIN_DB, SAFE_PHASE = 6.0, 25.0  # least margins by the model with which axes are moved
+LOOKED_AT = 400  # number of frequencies of the model
 
 
 def identify(bench: AutoBench, experiments: Identify) -> IdentifiedAxes:
-    """Check the wiring and identify; take out axes that cannot be tuned."""
+    """Check the wiring and identify; take axes that cannot be tuned out of the run."""
     target, going = bench.target, bench.going
     every: list[Identification] = []
     try:
@@ -61,7 +61,7 @@ def identify(bench: AutoBench, experiments: Identify) -> IdentifiedAxes:
 
 
 def prepare(bench: AutoBench, identified: IdentifiedAxes) -> Basis:
-    """Return the reference gains, calm gains, and whether the gains before are safe."""
+    """Compute the reference gains and calm gains, and check by the model whether the gains before are safe."""
     target = bench.target
     reference = np.ones_like(bench.before)
     calm, unsafe = reference.copy(), np.full(target.num_axes, "not checked", object)
@@ -75,7 +75,7 @@ def prepare(bench: AutoBench, identified: IdentifiedAxes) -> Basis:
 
 
 def calm_gains(target: Target, plant: Plant) -> Integers:
-    """Return gains stable with the rotor alone, too: within backlash, and above a resonance, it has no load."""
+    """Return gains that are stable also with the rotor alone: within backlash and above a resonance it has no load."""
     velocity_hz = cautious_bandwidth(target.motor, plant.inertia) * ROTOR_SHARE
     return bandwidth_gains(
         target.device, target.motor, plant.inertia, current_hz=CALM_CURRENT_HZ, velocity_hz=velocity_hz,
@@ -84,14 +84,14 @@ def calm_gains(target: Target, plant: Plant) -> Integers:
 
 
 def unsafe_gains(device: Device, plant: Plant, gains: Sequence[int]) -> str:
-    """Return why an axis must not be moved with gains, "" if it may."""
+    """Return why an axis must not be moved with gains; "" if it may."""
     if device.gains.opens(gains, *OPEN_LOOPS):
         return "a P gain is 0, so that a loop is open"
     rates = {"current": device.current_rate}
     for name, open_loop in OPEN_LOOPS.items():
         f = np.geomspace(1.0, 0.49 * rates.get(name, device.velocity_rate), LOOKED_AT)
         found = margins(f, open_loop(device, plant, gains, f))
-        # A loop whose gain is below 1 everywhere has all the phase there is.
+        # A loop whose gain is below 1 at all frequencies has no phase margin (nan), and passes.
         if found.gain_db < SAFE_GAIN_DB or found.phase_deg < SAFE_PHASE:
             return (
                 f"they are too near to instability: by the model, the {name} loop has {found.gain_db:.0f} dB of gain "
@@ -102,7 +102,7 @@ def unsafe_gains(device: Device, plant: Plant, gains: Sequence[int]) -> str:
 
 
 def identified_plant(target: Target, axis: int, identified: Identification) -> tuple[Plant | None, str]:
-    """Return the model of an axis; None, and why, where its wiring is wrong or too little was identified."""
+    """Build the model of an axis; None, and why, if its wiring is wrong or too little was identified."""
     if wrong := wrong_wiring(target, identified):
         return None, wrong
     try:
@@ -112,7 +112,7 @@ def identified_plant(target: Target, axis: int, identified: Identification) -> t
 
 
 def wrong_wiring(target: Target, identified: Identification) -> str:
-    """Name the fault of the wiring, "" if it is right."""
+    """Describe the error of the wiring; "" if it is correct."""
     direction, pairs = identified.estimates.get("encoder_direction"), identified.estimates.get("pole_pairs")
     if direction is not None and direction.value < 0.0:
         return identified.estimates["inertia"].reason

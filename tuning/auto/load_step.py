@@ -1,7 +1,7 @@
 """The response of axes at standstill to a load step: on emulated machines only, for a certificate.
 
-A load step cannot be applied to hardware. Nothing is identified by it, but gains with which an axis does not come to
-rest after it are not accepted.
+A load step cannot be applied to hardware. It identifies nothing, but gains with which an axis does not come to rest
+after it are rejected.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ if TYPE_CHECKING:
 
 NAME = "load step of 0.3 rated torque at standstill"
 SHARE = 0.3  # of the rated torque
-RECOVERED = 0.05  # of the dip: the band of recovery
-# s: until the axis stands, then recorded before the step and after it, and at the end of that looked whether it stands.
+RECOVERED = 0.05  # of the dip: recovery band
+# s: wait for standstill; recording before and after the step; and its last part, in which the axis must be at rest.
 REST, BEFORE, AFTER, LOOKED_AT = 0.1, 0.02, 0.3, 0.1
 SWING = "current at rest afterwards, RMS [% of rated]"
-NOISE = "noise of the current's measurement, RMS [% of rated]"  # where the swing is not small as it is
+NOISE = "noise of the current's measurement, RMS [% of rated]"  # added if the swing is above its limit
 
 
 def load_step(target: Target, where: Mask) -> dict[int, StepResponse]:
-    """Return the response of emulated axes to a load step with their present gains; axes that were off are off again.
+    """Return the response of emulated axes to a load step with their present gains; restore the enabled state.
 
-    Two load steps of opposite sign are made; the recording is of the first, the swing is the worst of all rests.
+    Load steps of both signs are applied; the first is recorded, the swing is the greatest of all four rests.
 
     Args:
         target: Emulated machines.
@@ -51,7 +51,7 @@ def load_step(target: Target, where: Mask) -> dict[int, StepResponse]:
         return {}
     machine = machine_of(drives)
     packed = one(machine.load)
-    # On the load, where it disturbs: the axis with the longest lever feels the share.
+    # The torque acts on the load: at the axis with the longest lever it equals the share.
     lever = float(np.abs(way(packed).joints @ packed.plant.disturbance[:, 0]).max())
     off = axes & ~cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED)
     motion.enable(drives, mode="pp", where=axes)
@@ -59,7 +59,7 @@ def load_step(target: Target, where: Mask) -> dict[int, StepResponse]:
     try:
         rest = drives.record([cia402.POSITION_ACTUAL, cia402.TORQUE_ACTUAL], BEFORE)
         windows = []
-        # Both ways, and what it does when the load is gone: loose gears swing one way and stand the other.
+        # Both signs, each with and without the load: an axis with backlash may swing in one and rest in the other.
         for share in (-SHARE, 0.0, SHARE, 0.0):
             machine.load_torque = np.where(machines, share * target.motor.rated_torque / lever, 0.0)
             windows.append(drives.record([cia402.POSITION_ACTUAL, cia402.TORQUE_ACTUAL], AFTER))
@@ -73,7 +73,7 @@ def load_step(target: Target, where: Mask) -> dict[int, StepResponse]:
     angle = wrapped(raw - raw[0]) / target.increments()
     current = np.concatenate([rest[cia402.TORQUE_ACTUAL], loaded[cia402.TORQUE_ACTUAL]]) * per_count
     t = np.arange(len(angle), dtype=np.float64) * CYCLE
-    # An integrator that is still on its way is no swing.
+    # The drift of an integrator that has not settled yet is no oscillation.
     ends = [
         detrend(per_count * window[cia402.TORQUE_ACTUAL][-round(LOOKED_AT / CYCLE) :], axis=0).std(axis=0)
         for window in windows

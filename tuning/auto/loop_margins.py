@@ -1,4 +1,4 @@
-"""The frequency response of the velocity loop with the new gains, and what it says of the loops."""
+"""Measures the frequency response of the velocity loop with the new gains, and the margins of both outer loops."""
 
 from __future__ import annotations
 
@@ -31,23 +31,23 @@ if TYPE_CHECKING:
     from tuning.response.measured_loop import AtLeast, MeasuredLoop
     from tuning.target import Target
 
-MEASURED = 0.08  # relative: what a measured slack may be off
-# What a measured margin may be off, one standard deviation of repeated measurements at most.
+MEASURED = 0.08  # relative: error of a measured slack
+# Errors of measured margins: at least one standard deviation of repeated measurements.
 PHASE_ERROR, GAIN_ERROR, MS_ERROR, OVERSHOOT_ERROR = 2.0, 0.5, 1.05, 0.02
-LEAST_LINES = 10  # of a frequency response, that are worth a judgement
-LONGER = 2  # times as long it is shaken where too little was seen
-LEAST_WAY = 1e-3  # rad; an axis without any way is shaken as little as can be, and its response says so
+LEAST_LINES = 10  # of a frequency response, that are needed to judge it
+LONGER = 2  # times the duration of the excitation, if too few lines are coherent
+LEAST_WAY = 1e-3  # rad; an axis without travel is excited with the least amplitude, and its response is then incoherent
 BOTH = (
     "margins are those of both ends together, computed from the part that fits the frequency responses of each end "
     "with the other one off"
 )
 NO_PART = "no part with one spring fits the frequency responses of both ends"
-IN_PLAY = 0.6  # of the inertia that moves showed: a response that shows less is that of the rotor in the play of a gear
-FREE_WINDOW = 100  # turns of following error that trip a frequency response: it means nothing there
+IN_PLAY = 0.6  # of the inertia from moves: a response with less is that of the rotor within the backlash of a gear
+FREE_WINDOW = 100  # turns; the following error is meaningless during a frequency response, and must not trip it
 
 
 def measure(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mask) -> RecordedGains:
-    """Measure the velocity loop's response of axes with their gains, and how far their loops keep the dynamics."""
+    """Measure the velocity loop's response of axes with their gains, and the slack of their loops to the dynamics."""
     going = where & bench.going & (recorded.failed == "")
     if bench.target.linked:
         return _with_slack(bench, basis, recorded, going)
@@ -59,7 +59,7 @@ def measure(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mask
     from tuning.response import frequency_response
 
     drives = bench.target.drives
-    # Trials have left the axes somewhere in their travel: what is left of it is counted from there.
+    # Trials ended anywhere in the travel: count the remaining travel from there.
     low, high = bench.room()
     here = replace(bench.target, low=low, high=np.maximum(high, LEAST_WAY))
     write_gains(drives, recorded.gains, going)
@@ -94,7 +94,7 @@ def measure(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mask
         else:
             unseen[k] = _in_play(bench.target, basis, response, k)
     if recorded.response is not None:
-        # What was measured with earlier gains tells of these, too, where nothing could be measured with them.
+        # If nothing could be measured with these gains, the response with earlier gains is used for them, too.
         earlier = [measured_axis(bench, basis, recorded, k) is not None for k in range(len(going))]
         kept = going & (unseen != "") & np.array(earlier)
         unseen[kept] = ""
@@ -105,7 +105,7 @@ def measure(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mask
 
 
 def _with_slack(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mask) -> RecordedGains:
-    """Return it with how far the loops of axes keep the dynamics, nan where they were not measured."""
+    """Add the slack of the axes' loops to the dynamics; nan if they were not measured."""
     slack = recorded.slack.copy()
     for k in map(int, np.flatnonzero(where)):
         one = measured_axis(bench, basis, recorded, k)
@@ -114,10 +114,10 @@ def _with_slack(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: 
 
 
 def measured_axis(bench: AutoBench, basis: Basis, recorded: RecordedGains, k: int) -> MeasuredAxis | LinkedAxis | None:
-    """Return the loops of an axis as they were measured, None if they were not.
+    """Return the measured loops of an axis; None if they were not measured.
 
-    Those of linked axes are known by the responses that identified them, each with the other one off: with gains that
-    are fit for both, one alone may swing.
+    Linked axes are judged by the responses from their identification, each with the other axis off: gains that are good
+    for both may oscillate with one alone.
     """
     target = bench.target
     if target.linked:
@@ -133,7 +133,7 @@ def measured_axis(bench: AutoBench, basis: Basis, recorded: RecordedGains, k: in
 
 
 def _unclear(bench: AutoBench, basis: Basis, recorded: RecordedGains, response: MeasuredLoop, going: Mask) -> Mask:
-    """Return the axes with too few coherent lines and enough time to measure longer, (num_axes,)."""
+    """Return the axes with too few coherent lines and enough drive time for a longer measurement, (num_axes,)."""
     left = bench.affordable(LONGER * bench.response_time + bench.response_time)
     unclear = np.zeros(bench.target.num_axes, bool)
     for k in map(int, np.flatnonzero(going & left)):
@@ -145,7 +145,7 @@ def _unclear(bench: AutoBench, basis: Basis, recorded: RecordedGains, response: 
 
 
 def _in_play(target: Target, basis: Basis, response: MeasuredLoop, k: int) -> str:
-    """Return that a response is not that of the whole axis, "" if it may be."""
+    """Return why a response is not that of the whole axis; "" if it may be."""
     fit, plant = response.fits[k], basis.identified.known(k)[0]
     alone = any(k in axes and len(axes) == 1 for axes in one_plant(target, basis.identified))
     if fit is None or fit.reason or not alone or fit.plant.inertia >= IN_PLAY * plant.inertia:
@@ -157,7 +157,7 @@ def _in_play(target: Target, basis: Basis, response: MeasuredLoop, k: int) -> st
 
 
 def _seen(response: MeasuredLoop, k: int) -> int:
-    """Count the coherent lines of an axis; where a model fits, together with their neighbours."""
+    """Count the coherent lines of an axis; with a fitted model, neighbouring lines are combined."""
     return round(float(response.refined(k)[2].mean()) * len(response.f))
 
 
@@ -167,7 +167,7 @@ def _without_response(recorded: RecordedGains, where: Mask, why: str) -> Recorde
 
 
 def judge(bench: AutoBench, basis: Basis, recorded: RecordedGains) -> RecordedGains:
-    """Return the final gains with their margins as measured, or lower bounds of them."""
+    """Add measured margins, or their lower bounds, to the final gains, and judge them in the journals."""
     for model, axes in loop_models(bench.target, basis.identified, recorded, bench.going, bench.dynamics):
         for k in map(int, axes):
             measured = measured_axis(bench, basis, recorded, k)
@@ -214,11 +214,11 @@ def _tell_variants(
     measured: MeasuredAxis | LinkedAxis | None,
     own: Integers,
 ) -> None:
-    """Add a reservation where a machine as it may become keeps too little; beyond stiff, reject it if measured."""
+    """Add a reservation if a variant of the machine keeps too little of the dynamics; reject it below "stiff"."""
     for dynamics, tell in ((bench.dynamics, journal.reserve), (find_dynamics("stiff"), journal.stop)):
         every = model.kept(dynamics, gains)
         if isinstance(measured, MeasuredAxis):
-            # Of coupled axes their model tells, too, what happens where all of them have another velocity P.
+            # The model of coupled axes also covers a change of the velocity P of all of them.
             told = measured.kept(dynamics, own)
             every |= {name: min(kept, every.get(name, kept)) for name, kept in told.items()}
         name, kept = min(every.items(), key=lambda one: one[1])
@@ -232,10 +232,10 @@ def _tell_variants(
 def _told_bounds(
     bench: AutoBench, basis: Basis, k: int, gains: Integers, response: MeasuredLoop, found: Mapping[str, Margins]
 ) -> dict[str, AtLeast]:
-    """Return lower bounds of an axis's margins; tell of those that stand for one that was not measured."""
+    """Return lower bounds of an axis' margins, and report those that replace a margin that was not measured."""
     journal, least, blank = bench.journals[k], {loop: response.at_least(loop, gains, k) for loop in LOOPS}, []
     for loop, one in least.items():
-        # A margin that was not measured, and of which the response has no bound.
+        # Loops with a margin that was not measured, and that the response gives no bound for.
         if any(
             math.isnan(getattr(one, name)) and not math.isfinite(getattr(found[loop], name)) for name in one._fields
         ):
@@ -253,7 +253,7 @@ def _told_bounds(
 
 
 def tell_overshoot(bench: AutoBench, journal: Journal, overshoot: float) -> None:
-    """Add a reservation if a step in csp overshoots by more than the dynamics allow; beyond stiff ones, reject."""
+    """Add a reservation if a step in csp overshoots more than the dynamics allow; reject it beyond "stiff"."""
     told = f"a step of the set-point by {STEP_SIZE} counts in csp overshoots by {100.0 * overshoot:.0f} %"
     for dynamics, tell in ((bench.dynamics, journal.reserve), (find_dynamics("stiff"), journal.stop)):
         if overshoot > dynamics.overshoot + OVERSHOOT_ERROR:
@@ -261,9 +261,9 @@ def tell_overshoot(bench: AutoBench, journal: Journal, overshoot: float) -> None
 
 
 class AskedMargin(NamedTuple):
-    """A margin that dynamics ask for: its name, its field of `Margins`, the limit, what a measurement may be off.
+    """A margin that dynamics ask for: its name, field of `Margins`, limit, and measurement error.
 
-    sign: 1 where the margin must be the limit at least, -1 where at most.
+    sign: 1 if the limit is the least allowed value, -1 if it is the greatest.
     """
 
     name: str
@@ -275,12 +275,12 @@ class AskedMargin(NamedTuple):
     sign: float = 1.0
 
     def missed(self, value: float, error: float = 0.0) -> bool:
-        """Return whether a value is beyond the limit by more than an error; one that was not measured is not."""
+        """Return whether a value is beyond the limit by more than an error; False for nan (not measured)."""
         return self.sign * (value - self.limit) < -error
 
 
 def asked_margins(dynamics: Dynamics) -> tuple[AskedMargin, ...]:
-    """Return the margins that dynamics ask for of each outer loop."""
+    """Return the margins that dynamics ask for, equal for both outer loops."""
     return (
         AskedMargin("phase margin", "phase_deg", dynamics.phase_deg, PHASE_ERROR, "degrees", 0),
         AskedMargin("gain margin", "gain_db", dynamics.gain_db, GAIN_ERROR, "dB", 1),
@@ -289,7 +289,7 @@ def asked_margins(dynamics: Dynamics) -> tuple[AskedMargin, ...]:
 
 
 def short_of(dynamics: Dynamics, found: Mapping[str, Margins]) -> list[str]:
-    """Return which margins of loops are smaller than the dynamics ask for, in words; what was not measured is not."""
+    """List the measured margins of loops that miss the dynamics by more than their error, as text."""
     texts = []
     for loop, one in found.items():
         for asked in asked_margins(dynamics):
@@ -306,7 +306,7 @@ def short_of(dynamics: Dynamics, found: Mapping[str, Margins]) -> list[str]:
 def _by_model(
     bench: AutoBench, basis: Basis, k: int, gains: Integers, loops: Sequence[str]
 ) -> tuple[dict[str, AtLeast], str]:
-    """Return lower bounds of the loops' margins by the model of the identified axis, and these in words."""
+    """Return lower bounds of the loops' margins by the model of the identified axis, and a text about them."""
     plant, identified = basis.identified.plants[k], basis.identified.found[k]
     why = "the axis was not identified" if identified is None else why_unbounded(identified)
     if any(k in axes and len(axes) > 1 for axes in one_plant(bench.target, basis.identified)):
@@ -329,7 +329,7 @@ def _in_words(least: AtLeast) -> str:
 
 
 def tell_bounds(journal: Journal, dynamics: Dynamics, loop: str, found: Margins, least: AtLeast) -> None:
-    """Add notes, or reservations if they are small, of the lower bounds of margins that were not measured."""
+    """Add notes on the lower bounds of margins that were not measured; reservations if they are below the limit."""
     for asked in asked_margins(dynamics):
         bound = getattr(least, asked.field, math.nan)
         if not math.isfinite(getattr(found, asked.field)) and math.isfinite(bound):

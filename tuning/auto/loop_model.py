@@ -1,8 +1,9 @@
-"""Identified machines as linear ones, as they are and as they may become: margins of their outer loops with any gains.
+"""Linear models of identified machines and their variants: margins of their outer loops with any gains.
 
-An axis of its own is a rotor with a disc, rigid or on one spring. The two ends of one part, as of a gantry, are two
-rotors on one mass that turns out of square on a spring: the response of each, with the other one off, says how much of
-the mass moves with it (its anti-resonance holds the end itself, its resonance neither), and together they say it all.
+A single axis is a rotor with a disc, rigid or on one spring. The two ends of one part, as of a gantry, are two rotors
+on one mass that can turn out of square on a spring: the response of each, with the other one off, shows how much of the
+mass moves with it (at its anti-resonance that end stands still, at its resonance neither); both together give all
+parameters.
 """
 
 from __future__ import annotations
@@ -34,15 +35,15 @@ if TYPE_CHECKING:
     from tuning.response.measured_loop import MeasuredLoop
     from tuning.target import Target
 
-# Of the mass matrix over the axes' own inertia: a share that measures as much without being there, and the least own
-# share of a motion for which it is believed.
+# Elements of the mass matrix over the axes' own inertia: greatest coupling that may be a measurement error; and least
+# own inertia of a motion for a coupling to be believed.
 FELT, LEAST_OWN = 0.15, 0.1
-AT_ONCE = 512  # machines that are computed at once
+AT_ONCE = 512  # number of machines that are computed at once
 TWIST = np.array([[1.0, -1.0], [-1.0, 1.0]])  # of two inertias on one spring
 
 
 class Mechanism(NamedTuple):
-    """What rotors move: M q'' + D q' + K q = torque, (joints, joints) each; what each turns, (axes, joints)."""
+    """Moved masses: M q'' + D q' + K q = torque, (joints, joints) each; motion of each rotor, (axes, joints)."""
 
     M: Floats
     D: Floats
@@ -50,13 +51,13 @@ class Mechanism(NamedTuple):
     rotors: Floats
 
     def varied(self, rotor: float, inertia: float, stiffness: float) -> Mechanism:
-        """Return it with other inertia and stiffness of what is beyond the rotors, each of this inertia [kg*m^2]."""
+        """Scale inertia and stiffness of everything except the rotors, each of which has inertia `rotor` [kg*m^2]."""
         own = self.rotors.T @ (np.minimum(rotor, np.diag(self.rotors @ self.M @ self.rotors.T))[:, None] * self.rotors)
         return self._replace(M=own + inertia * (self.M - own), K=stiffness * self.K)
 
 
 def one_axis(plant: Plant) -> Mechanism:
-    """Return the mechanism of an axis that is alone."""
+    """Return the mechanism of a single axis."""
     if not plant.is_elastic:
         return Mechanism(np.array([[plant.inertia]]), np.array([[plant.viscous]]), np.zeros((1, 1)), np.eye(1))
     rotor = plant.rotor_inertia
@@ -72,11 +73,11 @@ def two_ends(first: Plant, second: Plant) -> Mechanism | None:
     """Return the mechanism of two axes that drive one part, from the plant of each while the other one is off.
 
     Args:
-        first: One axis; its inertia is the whole one, its anti-resonance that of the part on the other rotor.
+        first: One axis; its inertia is that of everything, its anti-resonance that of the part on the other rotor.
         second: The other axis, likewise.
 
     Returns:
-        None where neither knows its resonance, or no mass has these frequencies.
+        The mechanism; None if neither resonance is known, or no mass has these frequencies.
     """
     elastic = [plant for plant in (first, second) if plant.is_elastic]
     if not elastic:
@@ -93,7 +94,7 @@ def two_ends(first: Plant, second: Plant) -> Mechanism | None:
     M = own + 0.5 * (total - own.sum()) * np.array([[0.0, 1.0], [1.0, 0.0]])
     damping = 2.0 * float(np.mean([plant.damping for plant in elastic])) * k / w
     viscous = 0.25 * (first.viscous + second.viscous) * np.eye(2)
-    # Each inertia is told by its own torque constant: that of the other axis may be another.
+    # Each inertia was identified with the torque constant of its own axis, which may differ from the other's.
     scale = np.sqrt([first.inertia / total, second.inertia / total])
     scale = np.outer(scale, scale)
     return Mechanism(M * scale, damping * TWIST + viscous, k * TWIST, np.eye(2))
@@ -104,11 +105,12 @@ class LoopModel:
 
     Args:
         device: The drive.
-        motor: The motor; its rotor's inertia stays where that of the load becomes another.
-        plants: Its axes; what their windings, filters and delays are.
-        moved: What they move.
-        inertia_range: What the load's inertia may become, over what it is.
-        measured: Whether the axis's response was measured: it says what another velocity P does, and no model need.
+        motor: The motor; its rotor's inertia stays the same in all variants of the load.
+        plants: Its axes, with their windings, filters and delays.
+        moved: The mechanism that they move.
+        inertia_range: Range of the load's inertia over the present one.
+        measured: Whether the axis' response was measured: that covers other values of velocity P, so no model is needed
+            for them.
     """
 
     def __init__(
@@ -139,12 +141,12 @@ class LoopModel:
         self._machines = linear_machines(windings, M, D, K, moved.rotors)
 
     def slack(self, dynamics: Dynamics, gains: Integers, *, nominal: bool = False) -> Floats:
-        """Return how far the loops keep the dynamics, relative, (sets,): 0 where a constraint is just kept.
+        """Return the relative slack of the loops to the dynamics, (sets,): 0 if a constraint is only just kept.
 
         Args:
-            dynamics: What they must keep.
+            dynamics: Requirements on the loops.
             gains: Raw, (sets, axes, count).
-            nominal: Whether to look at the machine as it is alone, not at what it may become.
+            nominal: Judge the present machine without its variants.
         """
         count = 1 if nominal else len(self._velocity_p)
         size = max(AT_ONCE // count, 1)
@@ -153,10 +155,10 @@ class LoopModel:
         return dynamics.slack(clearance[:, 0], clearance[:, 1:], overshoot)
 
     def kept(self, dynamics: Dynamics, gains: Integers) -> dict[str, float]:
-        """Return how much of the dynamics the machine keeps as it may become, by the name of what is different.
+        """Return the kept share of the dynamics for each variant of the machine, by the name of the variant.
 
         Args:
-            dynamics: What is 1.
+            dynamics: The dynamics that count as 1.
             gains: Raw, (axes, count).
         """
         clearance, _ = self._clearance(dynamics, gains[None], len(self._variants))
@@ -174,7 +176,7 @@ class LoopModel:
         return clearance.reshape(sets, count), overshoot
 
     def margins(self, gains: Integers) -> list[dict[str, Margins]]:
-        """Return the margins of the outer loops of each axis as the machine is, with gains, raw, (axes, count)."""
+        """Return the margins of the outer loops of each axis of the present machine, for raw gains, (axes, count)."""
         f = np.geomspace(LOWEST, HIGHEST * self.device.velocity_rate, POINTS)
         loops = self.open_loops(gains, f)
         return [
@@ -183,7 +185,7 @@ class LoopModel:
         ]
 
     def open_loops(self, gains: Integers, f: Floats) -> OuterLoops:
-        """Return the open loops of the machine as it is, each with the others closed, (axes, n).
+        """Return the open loops of the present machine, each with the others closed, (axes, n).
 
         Args:
             gains: Raw, (axes, count).
@@ -195,9 +197,9 @@ class LoopModel:
 
 
 def corner(device: Device, plant: Plant) -> float:
-    """Return the corner of the velocity filter [Hz] that delays as much as filter and delay of an axis together.
+    """Return the corner of a velocity filter [Hz] with the same lag as filter and delay of an axis together.
 
-    An emulated drive has no delay besides its own; low frequencies hardly distinguish the two lags.
+    An emulated drive has only its own delay; at low frequencies both lags are nearly equivalent.
     """
     from drive_env.devices.gains import VELOCITY_FILTER_DAMPING
 
@@ -207,24 +209,24 @@ def corner(device: Device, plant: Plant) -> float:
 
 
 def model_of(device: Device, motor: Motor, plant: Plant, dynamics: Dynamics, *, measured: bool = False) -> LoopModel:
-    """Return the model of an axis that is alone, with the load that dynamics ask for; `measured` as of `LoopModel`."""
+    """Return the model of a single axis with the load range of the dynamics; `measured` as in `LoopModel`."""
     return LoopModel(device, motor, [plant], one_axis(plant), dynamics.inertia_range, measured=measured)
 
 
 def measured_response(target: Target, recorded: RecordedGains | None, k: int) -> MeasuredLoop | None:
-    """Return the measured response of an axis; None if it was not measured, or if the axis is linked."""
+    """Return the measured response of an axis; None if it was not measured, or the axis is linked."""
     if target.linked or recorded is None or recorded.response is None or recorded.unseen[k]:
         return None
     return recorded.response if np.isfinite(recorded.response.open_loop[:, k]).any() else None
 
 
 class LinkedAxis:
-    """One of two linked axes with any gains, the other one's as they are: as `MeasuredAxis`, by the model of both.
+    """One of two linked axes with any gains, the other one with its present ones; an interface like `MeasuredAxis`.
 
     Args:
-        model: Of their machine, by the measured responses of both.
-        axis: Which of the two.
-        gains: Raw, of both, (2, count).
+        model: Model of their machine, from the measured responses of both.
+        axis: Index of the axis, 0 or 1.
+        gains: Present raw gains of both, (2, count).
     """
 
     def __init__(self, model: LoopModel, axis: int, gains: Integers) -> None:
@@ -236,21 +238,21 @@ class LinkedAxis:
         return whole
 
     def margins(self, gains: Integers) -> dict[str, Margins]:
-        """Return the margins of the outer loops with gains, (count,)."""
+        """Return the margins of the outer loops with gains of this axis, (count,)."""
         return self._model.margins(self._whole(gains[None])[0])[self._axis]
 
     def slack(self, dynamics: Dynamics, gains: Integers) -> Floats:
-        """Return how far the machine keeps the dynamics with gains of this axis, raw, (sets, count): (sets,)."""
+        """Return the slack of the machine to the dynamics with raw gains of this axis, (sets, count): (sets,)."""
         return self._model.slack(dynamics, self._whole(gains))
 
 
 def fitted_plant(
     target: Target, identified: IdentifiedAxes, recorded: RecordedGains | None, k: int
 ) -> tuple[Plant, Identification]:
-    """Return the plant of an axis and what is known of it: as identified, and as its response was fitted last.
+    """Return plant and identification of an axis, with the last good fit of its response.
 
-    That of an axis whose acceleration others feel is what it moves alone while they give way: its response has what
-    their loops do, too, which looks like a resonance.
+    The plant of an axis that is coupled to others by acceleration is the rigid inertia that it moves while the others
+        give way: its response contains their loops, which look like a resonance.
     """
     plant, found = identified.known(k)
     response = measured_response(target, recorded, k)
@@ -269,7 +271,7 @@ def fitted_plant(
 def loop_models(
     target: Target, identified: IdentifiedAxes, recorded: RecordedGains | None, where: Mask, dynamics: Dynamics
 ) -> list[tuple[LoopModel, Integers]]:
-    """Return the models of chosen axes: of all that are one plant together, of every other axis alone, and its axes."""
+    """Return models with their axes: one for each group of coupled axes, and one for each other axis."""
     models = []
     for group in one_plant(target, identified):
         axes = group[where[group]]
@@ -292,7 +294,7 @@ def loop_models(
 
 
 def one_plant(target: Target, identified: IdentifiedAxes) -> list[Integers]:
-    """Return the axes that were identified, those together that drive one part or feel each other's acceleration."""
+    """Return groups of identified axes: axes that drive one part or are coupled by acceleration form one group."""
     lanes, groups = target.axes_per_machine, []
     for machine in np.arange(target.num_axes).reshape(-1, lanes):
         axes = np.array([k for k in machine if identified.plants[k] is not None], np.int64)
@@ -302,7 +304,7 @@ def one_plant(target: Target, identified: IdentifiedAxes) -> list[Integers]:
             shares = M / np.sqrt(np.outer(np.diag(M), np.diag(M)))
             if np.linalg.eigvalsh(shares)[0] > LEAST_OWN:
                 felt = np.abs(shares) > FELT
-        # Two that feel a third one are of one plant, too.
+        # Two axes that are both coupled to a third one belong to one group.
         felt = np.linalg.matrix_power(felt | np.eye(len(axes), dtype=bool), lanes)
         while len(axes):
             groups.append(axes[felt[0]])
@@ -311,7 +313,7 @@ def one_plant(target: Target, identified: IdentifiedAxes) -> list[Integers]:
 
 
 def mass_matrix(target: Target, identified: IdentifiedAxes, axes: Integers) -> Floats:
-    """Return the mass matrix of axes of one machine at their rotors [kg*m^2], diagonal where it was not measured."""
+    """Return the mass matrix of axes of a machine at their rotors [kg*m^2]; diagonal if it was not measured."""
     lanes = target.axes_per_machine
     rows = []
     for axis in map(int, axes):

@@ -1,4 +1,4 @@
-"""Loops of an axis with any gains, by its measured velocity loop: margins, and how far they keep the dynamics."""
+"""The loops of an axis with any gains, computed from its measured velocity loop: margins, and slack to the dynamics."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ if TYPE_CHECKING:
     from tuning.response.measured_loop import MeasuredLoop
 
 AT_ONCE = 64  # sets of gains whose loops are computed at once
-LOOPS = "velocity", "position"  # that are judged
+LOOPS = "velocity", "position"  # the judged loops
 FACTORS = {
     variant.velocity_p: variant.name for variant in VARIANTS if variant.velocity_p != 1.0
-}  # that loops must bear
+}  # factors of velocity P that the loops must tolerate
 
 
 class MeasuredAxis:
-    """The outer loops of an axis with any gains: what was measured, times what these change of the linear model.
+    """The outer loops of an axis with any gains: the measured loop times the change of the linear model.
 
     Args:
         response: The measured velocity loop.
@@ -41,7 +41,7 @@ class MeasuredAxis:
         self._device = response.device
         self._plant = plant if fit is None or fit.reason else fit.plant
         f, L, trusted = response.refined(axis)
-        # Between lines and beyond those that are coherent the fitted model stands, where it fits.
+        # Between the lines, and where they are incoherent, the fitted model is used if it fits.
         seen = np.isfinite(L) & (trusted | (fit is not None and fit.is_good))
         self._f, self._measured, self._trusted = f[seen], L[seen], trusted[seen]
         self._gains = response.gains[axis]
@@ -51,7 +51,7 @@ class MeasuredAxis:
         )
 
     def open_loops(self, gains: Integers) -> dict[str, Complex]:
-        """Return the open loops with gains, raw, (sets, count): (sets, n) each, by loop."""
+        """Return the open loops for raw gains, (sets, count), by name: (sets, n) each."""
         now = [controllers(self._device, row) for row in gains]
         regulators = np.array([one.velocity(self._z) for one in now])
         inner = np.array([velocity_plant(self._device, self._plant, row, self._f) for row in gains])
@@ -67,20 +67,20 @@ class MeasuredAxis:
         return {loop: seen_margins(self._f, loops[loop][0], self._trusted) for loop in LOOPS}
 
     def slack(self, dynamics: Dynamics, gains: Integers) -> Floats:
-        """Return how far the judged loops keep the dynamics with gains, relative, (sets,); with other velocity P, too.
+        """Return the relative slack of the judged loops to the dynamics, (sets,), with variants of velocity P.
 
         Args:
-            dynamics: What they must keep.
+            dynamics: Requirements on the loops.
             gains: Raw, (sets, count).
         """
         parts = [gains[first : first + AT_ONCE] for first in range(0, len(gains), AT_ONCE)]
         return np.concatenate([self._slack(dynamics, part) for part in parts])
 
     def kept(self, dynamics: Dynamics, gains: Integers) -> dict[str, float]:
-        """Return how much of the dynamics the loops keep with another velocity P, by the name of what is different.
+        """Return the kept share of the dynamics with other velocity P, by the name of the variant.
 
         Args:
-            dynamics: What is 1.
+            dynamics: The dynamics that count as 1.
             gains: Raw, (count,).
         """
         other = self._device.gains.with_velocity_p(np.tile(gains, (len(FACTORS), 1)), np.array(list(FACTORS)))
@@ -98,11 +98,11 @@ class MeasuredAxis:
         return np.asarray(least)
 
     def _clearance(self, dynamics: Dynamics, gains: Integers) -> Floats:
-        """Return the least clearance of the judged loops, (sets,); below 0 where they would be unstable."""
+        """Return the least clearance of the judged loops, (sets,); below 0 if a loop would be unstable."""
         before, now = self.open_loops(self._gains[None]), self.open_loops(gains)
         least = np.full(len(gains), np.inf)
         for loop in LOOPS:
-            stable = is_as_stable(before[loop], now[loop])  # with the gains of the measurement the loop was stable
+            stable = is_as_stable(before[loop], now[loop])  # the measured loop was stable with its gains
             clearance = dynamics.clearance(now[loop])
             least = np.minimum(least, np.where(stable, clearance, -np.minimum(clearance, 1.0)))
         return least

@@ -1,4 +1,4 @@
-"""Lower bounds of margins that were not measured: the worst corner of an axis' identified intervals."""
+"""Lower bounds of margins that were not measured: the worst corner of the identified intervals of an axis."""
 
 from __future__ import annotations
 
@@ -20,27 +20,27 @@ if TYPE_CHECKING:
     from drive_env.loops.linear_model import Plant
     from tuning.identify.identified_axis import Identification
 
-# Estimates whose intervals have corners, and what a plant calls them; the first two go up and down together, since
-# they change the outer loops by little.
+# Estimates whose intervals are varied, and their fields in a plant; the first two are varied together, since they
+# change the outer loops only a little.
 WINDING = {"resistance": "R", "inductance": "L"}
 MECHANICS = {
     "inertia": "inertia", "velocity_filter": "velocity_filter", "loop_delay": "delay",
     "anti_resonance": "anti_resonance", "resonance": "resonance", "damping": "damping",
 }  # fmt: skip
-LEAST = 0.1  # of a value, where its interval reaches down to nothing
+LEAST = 0.1  # of a value, as lower end of an interval that reaches to 0
 
 
 def why_unbounded(identified: Identification) -> str:
-    """Return why the model of an identified axis gives no bound of its margins, "" if it does."""
+    """Return why the model of an identified axis gives no bound of its margins; "" if it gives one."""
     fit = identified.fit
     if fit is None or fit.reason:
         return f"its frequency response was not identified: {identified.estimates['resonance'].reason}"
     if not fit.is_good:
         return f"the linear model does not fit the axis: the error is {fit.misfit:.1f} times the noise"
     pair = [fit.estimates[name] for name in ("anti_resonance", "resonance")]
-    # Twins make do with a guess.
+    # Twins work with an assumed value, bounds need an identified one.
     if fit.plant.is_elastic and not all(one.is_known for one in pair):
-        # Both are refused by the same look at the response, mostly for the same reason.
+        # Both are refused by the same check of the response, mostly for the same reason.
         reasons = dict.fromkeys(one.reason for one in pair if one.reason)
         return f"its resonance is not known for certain: {'; '.join(reasons)}"
     return ""
@@ -52,11 +52,11 @@ def at_least_by_model(device: Device, plant: Plant, identified: Identification, 
     Args:
         device: The drive.
         plant: The identified axis.
-        identified: Its intervals; `why_unbounded` must have nothing against them.
+        identified: Its identification; `why_unbounded` must return "".
         gains: Raw gains, shape (count,).
 
     Returns:
-        By loop, "velocity" and "position"; nan where the loop is unstable at a corner, or a P gain is 0.
+        Bounds by loop, "velocity" and "position"; nan if the loop is unstable at a corner, or a P gain is 0.
     """
     nothing = AtLeast(math.nan, math.nan)
     if device.gains.opens(gains, "current", "velocity", "position"):
@@ -70,14 +70,14 @@ def at_least_by_model(device: Device, plant: Plant, identified: Identification, 
         velocity = velocity if second is None else velocity * second.response(f)
         for loop, L in (("velocity", velocity), ("position", outer_loop(device, corner, gains, f, velocity))):
             one = margins(f, L)
-            # A loop whose gain never passes 1 has all the phase there is.
+            # A loop whose gain never reaches 1 has an infinite phase margin; 180 degrees stand for it.
             found[loop].append((180.0 if math.isnan(one.phase_deg) else one.phase_deg, one.gain_db))
     least = {loop: AtLeast(*map(float, np.min(rows, axis=0))) for loop, rows in found.items()}
     return {loop: one if min(one) > 0.0 else nothing for loop, one in least.items()}
 
 
 def _corners(plant: Plant, identified: Identification) -> Iterator[Plant]:
-    """Yield an axis at all corners of its intervals; values that were not identified stay as they are."""
+    """Yield the axis at all corners of its intervals; values that were not identified are not varied."""
 
     def ends(names: Mapping[str, str]) -> dict[str, tuple[float, float]]:
         told = {field: identified.estimates.get(name) for name, field in names.items()}

@@ -22,12 +22,12 @@ if TYPE_CHECKING:
     from tuning.target import Target
 
 STEP_TIME = 1.0  # s of drive time for a step of the set-point
-CALMING = 0.5  # s after a load step that did not end, with gains that hold
+CALMING = 0.5  # s for an oscillation after a load step to decay with calm gains
 BY_COMPARISON = "by a move, which was better than with the new ones: the gains before are kept"
 
 
 def show(bench: AutoBench, recorded: RecordedGains, where: Mask) -> RecordedGains:
-    """Record a move of axes with their gains, and whether they are at rest afterwards."""
+    """Record a move of axes with their gains, and check whether they are at rest afterwards."""
     going = bench.target.together(where & bench.going)
     if not going.any():
         return recorded
@@ -53,7 +53,7 @@ def show(bench: AutoBench, recorded: RecordedGains, where: Mask) -> RecordedGain
 
 
 def step(bench: AutoBench, recorded: RecordedGains, where: Mask) -> RecordedGains:
-    """Make a small step of the set-point in csp with the gains of axes, and note by how much they overshoot it."""
+    """Make a small step of the set-point in csp with the gains of axes, and record the overshoot."""
     going = bench.whole_machines(where & bench.going & (recorded.failed == "")) & bench.affordable(STEP_TIME)
     if not going.any():
         return recorded
@@ -68,7 +68,7 @@ def step(bench: AutoBench, recorded: RecordedGains, where: Mask) -> RecordedGain
 
 
 def _shook(swing: float, noise: float, when: str) -> str:
-    """Return in words by how much a current swings, over the rated one."""
+    """Describe the swing of a current over the rated one."""
     told = f"its current swung by {100.0 * swing:.1f} % of the rated current (RMS) {when}"
     if noise > 0.0:
         alone = float(without_noise(swing, noise))
@@ -77,14 +77,14 @@ def _shook(swing: float, noise: float, when: str) -> str:
 
 
 def load(bench: AutoBench, basis: Basis, recorded: RecordedGains, target: Target, where: Mask) -> RecordedGains:
-    """Make a load step on emulated machines: what swings on after it does not come to rest.
+    """Make a load step on emulated machines: axes that oscillate after it fail.
 
     Args:
         bench: The drives.
-        basis: With gains that hold what swings.
+        basis: Has gains that damp an oscillation.
         recorded: The gains, and their move.
-        target: The drives, whose time is not counted, since a load step is not part of tuning.
-        where: Axes that are looked at, (num_axes,).
+        target: The drives with time that is not counted, since a load step is not part of tuning.
+        where: Axes to check, (num_axes,).
     """
     still = bench.whole_machines(where & bench.going & (recorded.failed == ""))
     if target.drives.machine is None or not still.any():
@@ -103,14 +103,14 @@ def load(bench: AutoBench, basis: Basis, recorded: RecordedGains, target: Target
             told = _shook(swing[k], noise[k], "after a load step of 0.3 of the rated torque")
             failed[k], most[k] = f"it does not come to rest: {told}", alone[k]
         if shook.any():
-            # What the load step has set swinging says nothing of the next gains.
+            # The oscillation must have decayed before the next gains are judged.
             write_gains(target.drives, basis.calm, bench.target.together(shook))
             target.drives.advance(CALMING)
     return replace(recorded, loaded=loaded, failed=failed, swing=most)
 
 
 def look_back(bench: AutoBench, basis: Basis, recorded: RecordedGains) -> RecordedGains:
-    """Record a move with the gains before, where they are safe by the model; keep them where they are better."""
+    """Record a move with the gains before if these are safe by the model; keep them if they are better."""
     going = bench.going
     late = ~bench.affordable(LOOK_BACK_TIME)
     why = np.where((basis.unsafe == "") & late, "the drive time was used up", basis.unsafe)
@@ -129,7 +129,7 @@ def look_back(bench: AutoBench, basis: Basis, recorded: RecordedGains) -> Record
     failed = able & (np.array(earlier.reason, object) != "")
     for k, causes in bench.faults().items():
         if able[k]:
-            # That is those gains' doing, and speaks for the new ones.
+            # The gains before caused the fault, which favours the new ones.
             failed[k] = True
             bench.journals[k].note(f"the drive went into fault in the move with the gains before: {causes}")
         else:
@@ -144,10 +144,10 @@ def look_back(bench: AutoBench, basis: Basis, recorded: RecordedGains) -> Record
 
 
 def keep_what_is_better(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mask) -> RecordedGains:
-    """Keep the gains before on machines whose loops keep the dynamics as well with them, and that moved better.
+    """Keep the gains before on machines whose loops keep the dynamics at least as well with them and that moved better.
 
-    A machine counts as its worst axis. Loops are judged as they were measured, and by the model as load, shaft and gain
-    may become; where they were not measured, nothing is kept. What a measurement is off is the same for both gains.
+    The worst axis of a machine counts. Loops are judged as measured, and by the model in all variants; if they were not
+    measured, the new gains stay. Measurement errors are the same for both gains, so they are ignored.
     """
     assert recorded.shown is not None and recorded.earlier is not None, "both moves are recorded"
     shown, earlier, axes = recorded.shown, recorded.earlier, bench.target.axes_per_machine
@@ -160,7 +160,7 @@ def keep_what_is_better(bench: AutoBench, basis: Basis, recorded: RecordedGains,
         for known, gains in ((of_before, basis.before), (of_new, recorded.gains)):
             known[own] = np.minimum(known[own], model.slack(bench.dynamics, gains[own][None])[0])
     now, before = (np.repeat(one.cost.reshape(-1, axes).max(axis=1), axes) for one in (shown, earlier))
-    # Gains with which an axis shakes at rest are never kept.
+    # Gains with which an axis oscillates at rest are never kept.
     kept = where & (before < now) & ~np.repeat(earlier.restless.reshape(-1, axes).any(axis=1), axes)
     kept = bench.whole_machines(kept & (of_before >= np.fmin(of_new, 0.0)))
     if not kept.any():

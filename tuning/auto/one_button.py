@@ -1,9 +1,9 @@
 """Automatic tuning in five stages: identify, design, try, verify and correct, certify; or roll back with the reason.
 
 Everything acts through the Drives interface, on all axes of a target at the same time, inside a transaction
-(snapshot.py): the state before is in a file before anything is changed, and an axis that fails a check gets it back.
-Gains are designed on digital twins, which costs no drive time, and corrected by what the drives show. `auto` calls the
-stages in this order, and what they hand on is in stages.py:
+(snapshot.py): the state before is saved to a file before anything is changed, and an axis that fails a check gets it
+back. Gains are designed on digital twins, which takes no drive time, and corrected by measurements on the drives.
+`auto` calls the stages in this order; stages.py defines the results that they pass on:
 
 1. identify: identified.py, with the wiring and the motor's parameters (settings.py);
 2. design: design.py, on twins (twin.py) and their linear models (loop_model.py);
@@ -47,9 +47,9 @@ if TYPE_CHECKING:
     from tuning.auto.result import Result
     from tuning.target import Target
 
-Progress = Callable[[str, float], None]  # what is under way, and how much of it all is done, 0...1
+Progress = Callable[[str, float], None]  # the present step, and the share of the run that is done, 0...1
 Files = Callable[["Result"], AbstractContextManager[object]]
-Find = Callable[[AutoBench, Basis, Progress], RecordedGains]  # for the axes that go on
+Find = Callable[[AutoBench, Basis, Progress], RecordedGains]  # finds gains for the axes in the run
 
 BUDGET = 18.0  # s of drive time
 
@@ -57,11 +57,11 @@ BUDGET = 18.0  # s of drive time
 class Method(NamedTuple):
     """How a run finds gains.
 
-    tuner: Its name in the certificate.
-    find: Finds gains, and tries them on the proving ground that it gives the bench; if it raises, everything is rolled
-        back. None is `on_twins`.
-    budget: Longest drive time for each axis of a machine [s]; steps beyond it are left out, with a note.
-    improves: Whether gains that keep the dynamics as measured give way to others that cost less on the digital twins.
+    tuner: Name in the certificate.
+    find: Finds gains and tries them on the proving ground that it sets in the bench; if it raises, everything is rolled
+        back. None selects `on_twins`.
+    budget: Greatest drive time per axis of a machine [s]; steps beyond it are skipped, with a note.
+    improves: Whether gains measured to keep the dynamics are replaced by others that cost less on the digital twins.
     """
 
     tuner: str = "auto"
@@ -84,22 +84,22 @@ def auto(
     experiments: Identify = identify_briefly,
     files: Files = nullcontext,
 ) -> Result:
-    """Tune the axes of a target; an axis that fails is rolled back, and the reason is in the result.
+    """Tune the axes of a target; an axis that fails is rolled back, with the reason in the result.
 
     Args:
-        target: The drives; they may have any gains, also none, and are off afterwards.
+        target: The drives; they may have any gains, even 0, and are off afterwards.
         file: File for the state before.
         method: How gains are found; designed on digital twins by default.
-        dynamics: What the loops must keep.
-        keep: Whether drives on a bus store the new gains, so that they survive a power cycle.
-        progress: Called with the present step, and the share done.
+        dynamics: Requirements on the loops.
+        keep: Whether drives on a bus store the new gains over a power cycle.
+        progress: Called with the present step, and the share that is done.
         experiments: The identification experiments.
-        files: Writes the result files before the drives store the gains; if it raises, everything is rolled back. Its
-            files must be removed if the block in it fails.
+        files: Writes the result files before the drives store the gains; if it raises, everything is rolled back. It
+            must remove its files if the block in it fails.
 
     Raises:
-        ValueError: For a drive without a linear model of its loops, before anything is done.
-        BusError: If the drives cannot be reached any more; the message says what state they are in and how to undo.
+        ValueError: For a drive without a linear model of its loops, before anything is written.
+        BusError: If the drives can no longer be reached; the message has their state and how to undo.
         OSError: If a file cannot be written; the drives then have their state from before.
     """
     check_linear_model(target.device)
@@ -127,7 +127,8 @@ def auto(
         accepted = write(bench, fresh, recorded.gains, transaction)
         kept = keep and bool(accepted.any()) and can_store(target)
         result = collect(bench, identified, recorded, transaction.path, kept)
-        # What cannot be written down is not left in the drives, and nothing is written of what they did not keep.
+        # Gains are only left in the drives if the files can be written, and the files stay only if the drives kept the
+        # gains.
         with files(result):
             if kept:
                 transaction.store(accepted)
@@ -145,10 +146,10 @@ def on_twins(bench: AutoBench, basis: Basis, say: Progress) -> RecordedGains:
 
 
 def by_rule(name: str) -> Method:
-    """Return the method that takes a rule's proposal for each identified axis.
+    """Return the method that uses a rule's proposal for each identified axis.
 
     Raises:
-        ValueError: For a rule that does not exist.
+        ValueError: For an unknown rule.
     """
     check_rule(name)
 
@@ -173,7 +174,7 @@ def tell_of_lateness(bench: AutoBench) -> None:
 
 
 def tune(target: Target, rng: np.random.Generator, dynamics: str | Dynamics = DEFAULT) -> Outcome:
-    """Tune a target as a tuner of `drive-tune rank`."""
+    """Tune a target; the tuner "auto" of `drive-tune rank`."""
     with tempfile.TemporaryDirectory() as folder:
         found = auto(target, Path(folder) / "before.toml", dynamics=dynamics, keep=False)
     return Outcome(

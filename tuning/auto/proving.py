@@ -1,8 +1,7 @@
 """Trials of gains on the drives: a move, its reversal and a gain probe.
 
-An axis that oscillates or goes into fault is stopped within 50 ms and gets gains that are known to be stable. On a bus
-the safety envelope may be faster: it quick-stops all drives, and the trial is repeated machine by machine to find which
-one caused it.
+An axis that oscillates or goes into fault is stopped within 50 ms and gets stable gains. On a bus the safety envelope
+may react first: it quick-stops all drives, and the trial is repeated machine by machine to find the one that caused it.
 """
 
 from __future__ import annotations
@@ -50,34 +49,35 @@ if TYPE_CHECKING:
     from drive_env.loops.linear_model import Plant
     from tuning.target import Target
 
-ASTRAY = 0.2  # of the move: what is still farther away at a trial's end does not pass
-# Of the move, and of the encoder: an axis farther than both from where a trial starts is brought back first.
+ASTRAY = 0.2  # of the move: greatest remaining error at the end of a passed trial
+# Of the move, and counts of the encoder: an axis farther than both from the start of a trial is first brought back.
 NEAR, NEAR_COUNTS = 0.03, 5.0
-RETURN_MOVES, RETURN_SPEED = 3.0, 0.5  # moves that are as short a way as one; of the speed limit, on longer ones
-RECOVERIES = 6  # attempts to reset a fault, with such a time between them
-SETTLING = 0.03  # s at rest before a trial, once the set-point is where the axis is
-STOPPING, STOPPING_LOOK = 400, 20  # cycles: the longest wait for axes to stand, and how often it is looked
-HOLDING, PATIENCE = 400, 2  # before a move for the record: cycles to wait for rest, windows for which an axis may shake
-STEP_COUNTS = 1.5  # of the encoder: what is less is no motion, and no step
-STILL_SHAKING = 2  # windows in a row: in the first one an axis is stopped
-RETURN_LOOKS, RETURN_LOOK = 8, 0.05  # looks whether it is back, and the time between them [s]
-OVERSHOOT = 0.6  # of the move: what overshoots by more is called unstable
-ENABLING = 5.0  # s, the longest wait for an axis that is switched on: some align their encoder first
-SHORTEST = 16.0  # counts of the encoder: a move that is shorter proves nothing
-# After a move for the record it is looked whether the axis stands, in so many places of an encoder count: a loop at its
-# edge swings between two counts in one place, and stands in another. Windows of 25 ms in each, how many of them pass
-# before, and what the current may swing (RMS about its mean, over the rated one), without the noise of its measurement.
+RETURN_MOVES, RETURN_SPEED = 3.0, 0.5  # moves: longest short return; share of the speed limit for longer ones
+RECOVERIES = 6  # attempts to reset a fault; RETURN_LOOK lies between them
+SETTLING = 0.03  # s at rest before a trial, after the set-point was moved to the axis
+STOPPING, STOPPING_LOOK = 400, 20  # cycles: longest wait for standstill, and time between two checks
+HOLDING, PATIENCE = 400, 2  # before a recorded move: cycles to wait for rest; windows for which an axis may oscillate
+STEP_COUNTS = 1.5  # of the encoder: smaller changes are neither motion nor a step
+STILL_SHAKING = 2  # windows in a row: the trial stops an axis in the first one
+RETURN_LOOKS, RETURN_LOOK = 8, 0.05  # number of checks whether an axis is back, and the time between them [s]
+OVERSHOOT = 0.6  # of the move: more overshoot counts as unstable
+ENABLING = 5.0  # s, longest wait until an axis is enabled: some align their encoder first
+SHORTEST = 16.0  # counts of the encoder: a shorter move proves nothing
+# After a recorded move it is checked whether the axis is at rest, at several positions within one encoder count: a loop
+# at its stability limit may oscillate between two counts at one position and rest at another. Number of positions,
+# windows of 25 ms at each, how many of them are skipped, and the greatest current (RMS about its mean, over the rated
+# one), without measurement noise.
 PLACES, REST, SETTLED, RESTLESS = 3, 6, 2, 0.05
-STEP_SIZE, STEPPING = 50, 200  # counts of a step of csp, and cycles that are looked at after it
-STEP_ANGLE = STEP_SIZE / 4096 * 2.0 * math.pi  # rad, of the finer encoders
-QUIETENING, NOISE_CYCLES = 50, 100  # with slow outer loops: until an axis is quiet, and that show the noise
+STEP_SIZE, STEPPING = 50, 200  # counts of a csp step, and cycles recorded after it
+STEP_ANGLE = STEP_SIZE / 4096 * 2.0 * math.pi  # rad, for finer encoders
+QUIETENING, NOISE_CYCLES = 50, 100  # cycles with slow outer loops: until an axis is quiet, and to measure the noise
 
 
 OBJECTS = [cia402.POSITION_ACTUAL, cia402.TORQUE_ACTUAL, cia402.STATUSWORD]  # recorded in every motion
 
 
 class Proof(NamedTuple):
-    """The results of a trial: J by measured terms, (num_axes,), and why each axis does not pass, "" if it does.
+    """The results of a trial: J by measured terms, (num_axes,), and why each axis fails, "" if it passes.
 
     stopped: Axes that oscillated or went into fault, (num_axes,).
     """
@@ -88,17 +88,20 @@ class Proof(NamedTuple):
 
     @property
     def passed(self) -> Mask:
-        """Which axes passed, shape (num_axes,)."""
+        """Axes that passed, shape (num_axes,)."""
         return np.array([not reason for reason in self.reason])
 
 
 class Shown(NamedTuple):
     """A recorded move: times [s], (n,); demanded and actual angle from its start [rad] and current [A], (n, num_axes).
 
-    where: Axes that made it, (num_axes,). reason: Of each axis, why it does not pass, "" if it does. cost: J by its
-    measured terms, (num_axes,). swing: Of the current at rest afterwards, in several places of an encoder count, over
-    the rated one (RMS over all), (num_axes,). noise: What the measurement of the current makes of that, alike; 0 where
-    it was not measured, since the swing is small enough as it is.
+    where: Axes that made it, (num_axes,).
+    reason: Why each axis fails, "" if it passes.
+    cost: J by its measured terms, (num_axes,).
+    swing: Current at rest afterwards, at several positions within an encoder count, over the rated one (RMS over all
+        positions), (num_axes,).
+    noise: Part of it caused by the measurement of the current, (num_axes,); 0 if not measured because the swing is
+        below its limit.
     """
 
     t: Floats
@@ -113,31 +116,31 @@ class Shown(NamedTuple):
 
     @property
     def restless(self) -> Mask:
-        """Which axes shook at rest, (num_axes,)."""
+        """Axes that oscillated at rest, (num_axes,)."""
         return self.where & (without_noise(self.swing, self.noise) > RESTLESS)
 
     def replaced(self, later: Shown) -> Shown:
-        """Return this with the axes of a later recording in their place."""
-        every: Any = zip(self[1:], later[1:], strict=True)  # all but the times
+        """Replace the axes of a later recording by it."""
+        every: Any = zip(self[1:], later[1:], strict=True)  # all fields except the times
         demand, actual, current, _, reason, *figures = (np.where(later.where, new, old) for old, new in every)
         return Shown(self.t, demand, actual, current, self.where | later.where, tuple(map(str, reason)), *figures)
 
 
 def without_noise(swing: Floats | float, noise: Floats | float) -> Floats:
-    """Return how much a current swings apart from the noise of its measurement; both RMS, and independent."""
+    """Return the current's swing without measurement noise; both are RMS and independent."""
     return np.asarray(np.sqrt(np.maximum(np.square(swing) - np.square(noise), 0.0)))
 
 
 class ProvingGround:
-    """Trials on a target, from where its axes stand, the longer way, each in its own travel.
+    """Trials on a target: each axis moves from its present position to the longer side of its travel.
 
     Args:
         target: The drives.
-        plants: The model of each axis; an axis with None takes no part.
-        room: How far each rotor may turn from here [rad], low and high, each (num_axes,).
-        safe: Gains known to be stable, (num_axes, count); an axis that is stopped gets them.
+        plants: Model of each axis; None for an axis that takes no part.
+        room: Signed angles that each rotor may turn from here [rad], low and high, each (num_axes,).
+        safe: Stable gains, (num_axes, count), for an axis that is stopped.
         reference: Gains whose softness under a load counts as 1, (num_axes, count).
-        held: Currents that a weight takes, and dry friction at least [A], (num_axes,) or one for all.
+        held: Current that a weight takes, and least current of dry friction [A], (num_axes,) or one value for all.
     """
 
     def __init__(
@@ -149,7 +152,8 @@ class ProvingGround:
         reference: Integers,
         held: tuple[ArrayLike, ArrayLike] = (0.0, 0.0),
     ) -> None:
-        # What a stop leaves swinging may feed safe gains as well; those that follow let the load ring down.
+        # After a stop, an oscillating load may keep even safe gains oscillating; the softer fallback gains let it
+        # decay.
         self._fallback = FallbackGains(target.num_axes, target.motor.rated_current, STILL_SHAKING)
         self._fallback.calm = target.device.gains.softened(safe, SOFTER, "velocity", "position")
         self.target = target = replace(target, drives=ObservedDrives(target.drives, self._fallback))
@@ -169,8 +173,8 @@ class ProvingGround:
             motor, inertia, drives.read(Role.POSITION_SCALE), reach, highest_ramp(target.device)
         )
         self._count: Floats = self.move.increments / self.move.counts  # increments
-        self._size = np.maximum(np.abs(self.move.distance), 1)  # of the move, likewise
-        self._counts: Floats = np.abs(self.move.distance) / self._count  # of the encoder in a move
+        self._size = np.maximum(np.abs(self.move.distance), 1)  # of the move, in increments
+        self._counts: Floats = np.abs(self.move.distance) / self._count  # counts of the encoder in a move
         top = RETURN_SPEED * target.speed * self.move.increments
         self._fastest: Floats = np.maximum(top / np.maximum(self.move.velocity, 1), 1.0)
         self._t_0 = 4.0 * small_time_constants(target.device, np.array(corner))
@@ -191,27 +195,27 @@ class ProvingGround:
         return np.where(self._shaken, RETURN_LOOKS * RETURN_LOOK + SETTLING, 0.0)
 
     def begin_here(self, where: Mask) -> None:
-        """Take where axes are as where the next move begins, of those that turn freely; the others are brought back."""
+        """Start the next move of axes with unlimited travel at their present position; others are brought back."""
         free = where & np.isinf(self.target.low) & np.isinf(self.target.high)
         self._origin = np.where(free, self.target.drives.read(cia402.POSITION_ACTUAL), self._origin)
 
     def recover(self, where: Mask) -> None:
-        """Reset faults of axes, and hold them with gains known to be stable; one that cannot stays as it is."""
+        """Reset faults of axes, and hold them with stable gains; an axis whose fault cannot be reset stays in it."""
         where = self.target.together(where)
         write_gains(self.target.drives, self.safe, where)
         for _ in range(RECOVERIES):
             self._trials.recover(where)
             if not (where & self._trials.down()).any():
                 break
-            # What a brake has put into the link must leave it first.
+            # The energy of the braking must leave the DC link first.
             self.target.drives.advance(RETURN_LOOK)
         self._shaken |= where
 
     def run(self, gains: Integers, where: Mask) -> Proof:
-        """Try gains, raw integers of shape (num_axes, count), on some axes; the others' figures are undefined.
+        """Try gains, raw integers of shape (num_axes, count), on some axes; results of the others are undefined.
 
-        Linked axes move together, all of them with these gains. Where the envelope stops all drives, machine by machine
-        tries them again, so that the one that caused it is known.
+        Linked axes move together, all with these gains. If the envelope stops all drives, the trial is repeated machine
+        by machine to find the one that caused it.
         """
         where, lanes = self.target.together(where), self.target.axes_per_machine
         try:
@@ -232,14 +236,14 @@ class ProvingGround:
     def show(self, gains: Integers, where: Mask) -> Shown:
         """Record one move with gains; an axis that oscillates or goes into fault gets stable gains within 50 ms.
 
-        Linked axes move together, all of them with these gains.
+        Linked axes move together, all with these gains.
         """
         drives, rated = self.target.drives, self.target.motor.rated_current
         where = self.target.together(where)
         self._fallback.begin()
         self._begin(where)
         self._hold_still(where)
-        stop_causes(drives)  # of before
+        stop_causes(drives)  # discards earlier ones
         write_gains(drives, gains, where)
         write_profile(drives, self.move, where)
         away = self._origin + self._direction * self.move.distance
@@ -262,7 +266,7 @@ class ProvingGround:
         error = wrapped(position - away) * way / self._size
         reason = self._reasons(stopped[None], error.max(axis=0), np.abs(error[-1]), stop_causes(drives))
         settling, noise, overshoot = move_terms(position.astype(float), current, self.move, self._t_0, rated, away, way)
-        # Of axes that take no part the gains may be none.
+        # Axes that take no part may have invalid gains.
         known = self.target.device.gains
         soft = softness(known, np.where(where[:, None], gains, self._reference)) / softness(known, self._reference)
         costs = cost(Terms(settling, soft, noise, overshoot, stopped))
@@ -273,12 +277,12 @@ class ProvingGround:
         return Shown(t, demand, actual, current, where, reason, costs, swing, measured)
 
     def step(self, gains: Integers, where: Mask) -> Floats:
-        """Return how far axes go beyond a step of their set-point in csp, there and back, over the step, (num_axes,).
+        """Return the overshoot of a csp set-point step, there and back, over the step, (num_axes,).
 
-        The step is STEP_SIZE counts of an encoder of 4096, or of a coarser one of the motor: small enough for the loops
-        to stay linear, and large enough for friction and noise not to matter. A first one, there and back, does not
-        count: by it the integrator lets go of what dry friction has kept in it. Linked axes step together. It is there
-        for the loops: a feed-forward, which answers the jump with a push of its own, is off meanwhile.
+        The step is STEP_SIZE counts of an encoder with 4096 counts, or of a coarser one of the motor: small enough for
+        the loops to stay linear, and large enough for friction and noise not to matter. A first step, there and back,
+        is not counted: it releases what dry friction has stored in the integrator. Linked axes step together. The step
+        tests the loops only: feed-forward, which would respond to the step itself, is off during it.
         """
         drives, where = self.target.drives, self.target.together(where)
         self._fallback.begin()
@@ -303,21 +307,21 @@ class ProvingGround:
         return np.where(where, worst, np.nan)
 
     def noise(self, gains: Integers, where: Mask) -> Floats:
-        """Return the noise of the measured current at rest, over the rated current (RMS).
+        """Measure the noise of the measured current at rest, over the rated current (RMS).
 
         Args:
-            gains: That they have afterwards, (num_axes, count); the current loop works with these.
-            where: Axes, (num_axes,); those that pull at the same thing take part, too.
+            gains: Gains that the axes get afterwards, (num_axes, count); the current loop uses them.
+            where: Axes, (num_axes,); axes linked with them take part, too.
         """
         where = self.target.together(where)
         self._begin(where)
         return self._noise(gains, where)
 
     def _noise(self, gains: Integers, where: Mask) -> Floats:
-        """Return the noise of axes that are enabled, (num_axes,); 0 of the others.
+        """Return the noise of enabled axes, (num_axes,); 0 for the others.
 
-        The outer loops are slow meanwhile, so that they do not amplify it. Their own swing, should they have one, is
-        slow as well and counts for little: noise is new in every sample, and changes by sqrt(2) of its RMS value.
+        The outer loops are slow during the measurement, so that they do not amplify it. An oscillation of these is
+        slow, too, and adds little: noise is independent in every sample, and its change is sqrt(2) of its RMS value.
         """
         noise = np.zeros(self.target.num_axes)
         where = self.target.together(where)
@@ -334,18 +338,18 @@ class ProvingGround:
         return np.where(where, np.minimum(current.std(axis=0), change) / self.target.motor.rated_current, noise)
 
     def _swing(self, at: Integers, where: Mask) -> Floats:
-        """Return how much the current swings at rest in several places, over the rated one (RMS over all of them).
+        """Return the swing of the current at rest at several positions, over the rated one (RMS over all of them).
 
         Args:
-            at: Where the axes are [inc]; they end within a count of it, on the side from which they came.
-            where: Axes that are looked at; one that oscillates is stopped.
+            at: Positions of the axes [inc]; they end within a count of it, on the side they came from.
+            where: Axes to check; one that oscillates is stopped.
         """
         drives, rated = self.target.drives, self.target.motor.rated_current
         back = -np.sign(self._direction * self.move.distance)
         squares, worst = np.zeros((2, self.target.num_axes))
         for place in range(PLACES):
             if place:
-                # Increments may be as coarse as counts.
+                # At least one increment: increments may be as coarse as counts.
                 apart = np.maximum(np.rint(place * self._count / PLACES), place)
                 start(drives, wrapped(at + back * apart).astype(np.int64), where)
             seen = []
@@ -359,9 +363,9 @@ class ProvingGround:
         return np.maximum(worst, np.sqrt(squares) * self._ampere / rated)
 
     def _hold_still(self, where: Mask) -> None:
-        """Come to rest with the present gains, and start from there: a frequency response leaves an axis turning.
+        """Wait for rest with the present gains, and start from there: a frequency response leaves an axis turning.
 
-        An axis that still swings after a second window of 25 ms is stopped.
+        An axis that still oscillates after PATIENCE windows of 25 ms is stopped.
         """
         windows = np.zeros(self.target.num_axes, np.int64)
         for _ in range(HOLDING // WATCH):
@@ -373,12 +377,12 @@ class ProvingGround:
         self._begin_without_a_step(where)
 
     def _shakes(self, seen: Trace) -> Mask:
-        """Return which axes oscillated in a recording, or are off at its end."""
+        """Return which axes oscillated in a recording, or are not enabled at its end."""
         shaking = shakes(seen[cia402.TORQUE_ACTUAL] * self._ampere, self.target.motor.rated_current)
         return np.asarray(shaking | ~cia402.matches(seen[cia402.STATUSWORD][-1], cia402.OPERATION_ENABLED))
 
     def _stop(self, where: Mask) -> Mask:
-        """Give axes, and those linked with them, stable gains; return which got them."""
+        """Give stable gains to axes and those linked with them; return all of these."""
         where = self.target.together(where)
         if where.any():
             write_gains(self.target.drives, self.safe, where)
@@ -392,7 +396,7 @@ class ProvingGround:
         self._fallback.begin()
         self._begin(where)
         self.moves[where] += len(PHASES)
-        stop_causes(self.target.drives)  # of before
+        stop_causes(self.target.drives)  # discards earlier ones
         tried = self._trials.run(gains, self.safe, self.move, self._origin, self._direction, where)
         self._gone(where)
         known = self.target.device.gains
@@ -401,18 +405,18 @@ class ProvingGround:
         stopped = where & tried.aborted.any(axis=0)
         self.aborts[stopped] += 1
         self._shaken |= stopped
-        # Behind its demand at the end of the move, or from where it should be now: a demand may stand still, too.
+        # The error at the end of the move, or the present distance from its end: the demand may have stopped, too.
         now = np.abs(wrapped(self.target.drives.read(cia402.POSITION_ACTUAL) - self._origin)) / self._size
         left = np.maximum(np.abs(tried.error[TRIAL - 1]), now)
         return Proof(costs, self._reasons(tried.aborted, tried.terms.overshoot[:2].max(axis=0), left, causes), stopped)
 
     def _gone(self, where: Mask) -> None:
-        """Count on from where a move has ended: the next one goes the other way."""
+        """Set the start of the next move to the end of this one, in the other direction."""
         self._origin = np.where(where, self._origin + self._direction * self.move.distance, self._origin)
         self._direction = np.where(where, -self._direction, self._direction)
 
     def _begin(self, where: Mask) -> None:
-        """Enable axes that are off, with stable gains, and bring those back that are not where they should be."""
+        """Enable axes that are off with stable gains, and bring axes back to the start of the next move."""
         drives = self.target.drives
         down = self.target.together(where & self._trials.down())
         if down.any():
@@ -423,9 +427,9 @@ class ProvingGround:
         self._begin_without_a_step(where)
 
     def _come_to_rest(self, where: Mask) -> None:
-        """Enable axes and wait until they are at rest: one that still turns is taken over at its speed.
+        """Enable axes in csv and wait until they are at rest.
 
-        Slow gains stop it sooner by its velocity than by its position.
+        An axis that still turns is taken over at its speed: slow gains stop it sooner by velocity than by position.
         """
         drives = self.target.drives
         motion.enable(drives, mode="csv", where=where, timeout=ENABLING)
@@ -437,11 +441,11 @@ class ProvingGround:
         self.begin_here(where)
 
     def _return(self, where: Mask) -> None:
-        """Bring axes back that are not where they should be, since they were stopped, fell, or ran away."""
+        """Bring axes back to the start of the next move that were stopped, fell, or moved away."""
         drives = self.target.drives
         near = np.maximum(NEAR * np.abs(self.move.distance), NEAR_COUNTS * self._count)
         off = np.abs(wrapped(drives.read(cia402.POSITION_ACTUAL) - self._origin))
-        # A long way is not to take long, and a weight that goes down by it not to overcharge the DC link.
+        # A long way must not take long, and a weight that goes down must not overcharge the DC link.
         faster = np.clip(off / (RETURN_MOVES * np.maximum(np.abs(self.move.distance), 1)), 1.0, self._fastest)
         way, speed, ramp = (
             row / self.move.increments for row in (off, faster * self.move.velocity, faster * self.move.acceleration)
@@ -460,14 +464,14 @@ class ProvingGround:
         self.moves[astray] += 1
         longest = np.max(off / back.velocity, where=astray, initial=0.0)
         for _ in range(max(RETURN_LOOKS, math.ceil(longest / RETURN_LOOK) + 2)):
-            # All the while: a load that was shaken swings on, and would be taken for the next gains' doing.
+            # Wait for the whole time: an oscillating load would be blamed on the next gains.
             seen = drives.record([cia402.POSITION_ACTUAL], RETURN_LOOK)[cia402.POSITION_ACTUAL]
             if not np.any(astray & (np.abs(wrapped(seen - self._origin)).max(axis=0) > near)):
                 break
         self._shaken &= ~astray
 
     def _begin_without_a_step(self, where: Mask) -> None:
-        """Set the set-point to where the axes are.
+        """Move the set-point to the present positions of the axes.
 
         The remaining error of slow gains, or a rotation during commutation alignment, would be a step for fast gains,
         and its transient would look like an oscillation.
@@ -491,13 +495,13 @@ class ProvingGround:
         return Proof(np.full(len(where), TRIP), (why,) * len(where), where)
 
     def _reasons(self, stopped: Mask, overshoot: Floats, left: Floats, causes: Sequence[str]) -> tuple[str, ...]:
-        """Return why axes do not pass, "" where they do.
+        """Return why axes fail; "" if they pass.
 
         Args:
-            stopped: Whether they were stopped, a row for each phase, (phases, num_axes).
-            overshoot: Of the move, (num_axes,).
-            left: Of the move, what was missing at its end, (num_axes,).
-            causes: What the drives have told meanwhile.
+            stopped: Axes that were stopped, one row per phase, (phases, num_axes).
+            overshoot: Over the move, (num_axes,).
+            left: Error at the end of the move, over the move, (num_axes,).
+            causes: Emergencies of the drives during the trial.
         """
         most_left = np.maximum(ASTRAY, 5.0 / np.maximum(self._counts, 1.0))
         reasons = []

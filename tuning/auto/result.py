@@ -1,4 +1,4 @@
-"""The result of auto: what became of each axis, and the drive time it took."""
+"""The result of auto: the outcome of each axis, and the drive time."""
 
 from __future__ import annotations
 
@@ -27,24 +27,24 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class AxisResult:
-    """What became of one axis.
+    """The outcome of one axis.
 
     Attributes:
         before, after: Raw gains, in the order of the device's gain set.
-        reason: Why it was rejected; "" where all checks passed, with reservations or without.
-        reservations: Checks that could not be made or are near a limit; with any of them the certificate is not a plain
-            accept.
+        reason: Why it was rejected; "" if all checks passed, with or without reservations.
+        reservations: Checks that were impossible or are close to a limit; with any of them the certificate says
+            "accepted with reservations".
         notes: Further remarks.
-        identified: The identification, None where there was none.
-        plant: The axis model made of it, None where that was not possible.
-        twin: Robust cost on the twin of the gains that were found; nan where none were.
-        proof: J by measured terms of the gains that were taken; nan where none passed a trial.
-        verified: How the gains were verified, in words; "" where they were not.
-        margins: Of the outer loops as measured, "velocity" and "position"; nothing where nothing was.
-        at_least: Lower bounds of margins that were not measured, likewise.
-        slack: How far the measured loops keep the dynamics, relative; nan where they were not measured.
-        overshoot: Of a step of the set-point in csp, over the step; nan where none was made.
-        corrections: Gains that gave way to others, in their order.
+        identified: The identification; None without one.
+        plant: The axis model built from it; None if that was impossible.
+        twin: Robust cost on the twin of the gains that were found; nan without any.
+        proof: J by measured terms of the accepted gains; nan if none passed a trial.
+        verified: How the gains were verified; "" if they were not.
+        margins: Measured margins of the outer loops, "velocity" and "position"; empty if not measured.
+        at_least: Lower bounds of margins that were not measured, by the same names.
+        slack: Relative slack of the measured loops to the dynamics; nan if not measured.
+        overshoot: Overshoot of a set-point step in csp, over the step; nan if not made.
+        corrections: Replaced gains, in their order.
         is_kept: Whether the gains before were better and are kept.
     """
 
@@ -67,22 +67,26 @@ class AxisResult:
 
     @property
     def accepted(self) -> bool:
-        """Whether all checks passed, with reservations or without."""
+        """Whether all checks passed, with or without reservations."""
         return not self.reason
 
     @property
     def verdict(self) -> str:
-        """Which of `tuning.certificate.certificate.VERDICTS` it is."""
+        """The entry of `tuning.certificate.certificate.VERDICTS` that applies to the axis."""
         return verdict(self.accepted, self.reservations)
 
 
 class Result(NamedTuple):
     """The result of a run of auto: the axes, and what it took.
 
-    drive_seconds, moves, aborts and violations: Of each axis, (num_axes,). shown: A recorded move with the new gains,
-    None if none was made. earlier: One with those before, likewise. response: The velocity loop's, likewise.
-    loaded: Response to a load step, of emulated machines. dynamics: What the loops were to keep.
-    file: The snapshot that brings everything back. kept: Whether drives on a bus stored the gains.
+    drive_seconds, moves, aborts, violations: Counts of each axis, (num_axes,).
+    shown: A recorded move with the new gains; None without one.
+    earlier: A recorded move with the gains before; None without one.
+    response: Frequency response of the velocity loop; None without one.
+    loaded: Responses to a load step, of emulated machines.
+    dynamics: Requirements on the loops.
+    file: The snapshot that restores the state before.
+    kept: Whether drives on a bus stored the gains.
     """
 
     axes: tuple[AxisResult, ...]
@@ -100,12 +104,12 @@ class Result(NamedTuple):
 
     @property
     def accepted(self) -> Mask:
-        """Which axes have gains that passed, new ones or those before, shape (num_axes,)."""
+        """Axes with gains that passed, new ones or those before, shape (num_axes,)."""
         return np.array([axis.accepted for axis in self.axes])
 
 
 def collect(bench: AutoBench, identified: IdentifiedAxes, recorded: RecordedGains, file: Path, kept: bool) -> Result:
-    """Return the result of a run: of the axes that were accepted with their gains."""
+    """Collect the result of a run from the bench and the record of the final gains."""
     axes = []
     for k, journal in enumerate(bench.journals):
         before = bench.before[k]

@@ -1,4 +1,4 @@
-"""What auto writes besides gains: the motor's parameters to a factory-fresh drive; all else is restored at the end."""
+"""Writes the settings besides gains: motor parameters of factory-fresh drives, wiring; restores all else at the end."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from tuning.auto.stages import IdentifiedAxes
     from tuning.target import Target
 
-LEAST_WAY = 0.2  # rad between the ends of the travel: finding the poles alone turns a rotor so far
+LEAST_WAY = 0.2  # rad, least travel: finding the poles alone turns a rotor this far
 
 
 def begin(bench: AutoBench) -> None:
@@ -39,9 +39,9 @@ def begin(bench: AutoBench) -> None:
 
 
 def commission(bench: AutoBench, identified: IdentifiedAxes) -> Mask:
-    """Write the motor's parameters to factory-fresh drives, and the wiring settings to any; return which were fresh.
+    """Write the motor's parameters to factory-fresh drives, and wiring settings to any; return which were fresh.
 
-    Identification did so, too, but left drives as they were.
+    Identification wrote them, too, but restored the drives afterwards.
     """
     target = bench.target
     fresh: Mask = bench.going & (target.drives.read(Role.MOTOR_TYPE) == 0)
@@ -59,7 +59,7 @@ def commission(bench: AutoBench, identified: IdentifiedAxes) -> Mask:
 
 
 def ignore_unwired_switches(target: Target, where: Mask) -> Mask:
-    """Ignore the limit switches of axes where both are active, since they are not connected then; return these axes."""
+    """Ignore limit switches of axes on which both are active, so not connected; return these axes."""
     if Role.LIMIT_SWITCHES not in target.device.roles:
         return np.zeros_like(where)
     unwired: Mask = where & (target.drives.read(cia402.DIGITAL_INPUTS) & BOTH_ENDS == BOTH_ENDS)
@@ -68,13 +68,13 @@ def ignore_unwired_switches(target: Target, where: Mask) -> Mask:
 
 
 def told_unwired(target: Target) -> str:
-    """Return the note on switches that are ignored."""
+    """Return the note on ignored switches."""
     index, _ = target.device.roles[Role.LIMIT_SWITCHES]
     return f"both limit switches were active at once, so they are not connected: they are ignored ({index:04X}h)"
 
 
 def _wire(bench: AutoBench, identified: IdentifiedAxes, fresh: Mask) -> None:
-    """Write the wiring settings: as identified, or else the known ones of a factory-fresh drive's motor."""
+    """Write the wiring settings as identified; for factory-fresh drives the motor's known ones where not identified."""
     target = bench.target
     known = {key: value for key, value in motor_parameters(target).items() if key in findings(target.device)}
     wanted: list[dict[Key, int]] = []
@@ -89,13 +89,13 @@ def _wire(bench: AutoBench, identified: IdentifiedAxes, fresh: Mask) -> None:
 
 
 def write(bench: AutoBench, fresh: Mask, gains: Integers, transaction: Transaction) -> Mask:
-    """Leave the accepted axes with gains and restore everything else; return which they are, (num_axes,).
+    """Leave the accepted axes with gains and restore everything else; return these axes, (num_axes,).
 
     Args:
         bench: The drives.
-        fresh: Those that came fresh from the factory, and keep what they were commissioned with, (num_axes,).
+        fresh: Axes that were factory-fresh, which keep the parameters written by `commission`, (num_axes,).
         gains: Raw, (num_axes, count).
-        transaction: With the state before.
+        transaction: Has the state before.
     """
     bench.drop_faults("its gains were verified")
     going = bench.going
@@ -105,7 +105,7 @@ def write(bench: AutoBench, fresh: Mask, gains: Integers, transaction: Transacti
     drives = bench.target.drives
     write_gains(drives, gains, going)
     motion.disable(drives, where=going)
-    # 0, no mode, is what a drive has before its first; it cannot be written.
+    # 0, no mode, is the value before the first mode; it cannot be written.
     other = going & (bench.modes != 0) & (drives.read(cia402.MODE) != bench.modes)
     if other.any():
         drives.write(cia402.MODE, bench.modes, where=other)
@@ -123,9 +123,9 @@ def write(bench: AutoBench, fresh: Mask, gains: Integers, transaction: Transacti
 
 
 def motor_parameters(target: Target) -> dict[Key, int]:
-    """Return the motor's parameters for a drive by their keys, without those of the encoder's initialisation.
+    """Return the motor's parameters for a drive by key, without those of the encoder's initialisation.
 
-    Presets take the encoder's offset as known, which it is not here.
+    Presets assume a known encoder offset, which is unknown here.
     """
     dictionary, left = target.device.new_dictionary(), target.device.roles.get(Role.ENCODER_INITIALISATION)
     entries = [(dictionary.find(name), value) for name, value in target.device.preset(target.motor).items()]

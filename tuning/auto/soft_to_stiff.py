@@ -1,4 +1,4 @@
-"""Gains of an axis from soft to stiff, in one number, by its measured velocity loop."""
+"""Gains of an axis from soft to stiff, selected by one number, designed with its measured velocity loop."""
 
 from __future__ import annotations
 
@@ -24,10 +24,11 @@ if TYPE_CHECKING:
 
 
 class SoftToStiff(NamedTuple):
-    """Gains designed for each of the named dynamics, the softest first, and those between them.
+    """Gains designed for each of the named dynamics, the softest first, with interpolation between them.
 
-    gains: Raw, (dynamics, count). slack: How far they keep their dynamics, relative, (dynamics,); below 0 where no
-    gains keep them. columns: Which gains are those of the cascade; others, as a feed-forward, stay as they are.
+    gains: Raw, (dynamics, count).
+    slack: Relative slack to their dynamics, (dynamics,); below 0 if no gains keep them.
+    columns: Columns of the cascade's gains; others, such as a feed-forward, are not changed.
     """
 
     gains: Integers
@@ -35,7 +36,7 @@ class SoftToStiff(NamedTuple):
     columns: tuple[int, ...]
 
     def dynamics(self, place: float) -> Dynamics:
-        """Return the dynamics at a place, 0 for the softest to 1 for the stiffest; between named ones in proportion."""
+        """Return the dynamics at a place, 0 for the softest to 1 for the stiffest, interpolated between named ones."""
         rows = list(known_dynamics().values())
         at = place * (len(rows) - 1)
         if at == round(at):
@@ -45,7 +46,7 @@ class SoftToStiff(NamedTuple):
         return find_dynamics(f"{phase:.1f}/{gain:.1f}/{ms:.2f}")
 
     def at(self, place: float, present: Sequence[int]) -> tuple[int, ...]:
-        """Return raw gains at a place, 0 to 1, between designs in equal ratios; `present` are those in force."""
+        """Return raw gains at a place, 0 to 1, with logarithmic interpolation; `present` are those in force."""
         found = list(present)
         for k in self.columns:
             logs = np.log(np.maximum(self.gains[:, k], 1))
@@ -60,12 +61,12 @@ def soft_to_stiff(
 
     Args:
         measured: The velocity loop.
-        motor: The motor; what the load's inertia may become counts without its rotor.
-        axis: Of the measurement.
-        say: Called with the share done; what it raises ends the design.
+        motor: The motor; variants of the load's inertia do not change its rotor's.
+        axis: Index in the measurement.
+        say: Called with the share that is done; an exception from it ends the design.
 
     Raises:
-        ValueError: Where the response was not measured well enough to be computed with other gains.
+        ValueError: If the response was not measured well enough to compute it for other gains.
     """
     fit, device = measured.fits[axis], measured.device
     if fit is None or not fit.is_good:
@@ -84,6 +85,6 @@ def soft_to_stiff(
 
 
 def _slack(model: LoopModel, loops: MeasuredAxis, dynamics: Dynamics, gains: Integers, nominal: bool) -> Floats:
-    """Return how far rows of gains keep dynamics by the model and, unless `nominal`, by the measured loops, too."""
+    """Return the slack of rows of gains to dynamics by the model and, unless `nominal`, also by the measured loops."""
     by_model = model.slack(dynamics, gains[:, None], nominal=nominal)
     return by_model if nominal else np.minimum(by_model, loops.slack(dynamics, gains))

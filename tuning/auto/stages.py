@@ -1,4 +1,4 @@
-"""What the stages of auto hand on to each other; it is never changed, the next stage makes its own of it."""
+"""The immutable results that the stages of auto pass on; a stage creates new ones from those before."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class IdentifiedAxes:
-    """What was identified of each axis.
+    """The identification of each axis.
 
     Attributes:
-        found: The identification, None where there was none.
-        plants: The axis model made of it, None where that was not possible.
+        found: The identification; None without one.
+        plants: The axis model built from it; None if that was impossible.
     """
 
     found: tuple[Identification | None, ...]
     plants: tuple[Plant | None, ...]
 
     def known(self, axis: int) -> tuple[Plant, Identification]:
-        """Return model and identification of an axis that goes on."""
+        """Return model and identification of an axis in the run."""
         plant, found = self.plants[axis], self.found[axis]
         assert plant is not None and found is not None, "an axis in the run has both"
         return plant, found
@@ -43,14 +43,14 @@ class IdentifiedAxes:
 
 @dataclass(frozen=True)
 class Basis:
-    """What the search for gains starts from, and what is fallen back on.
+    """The data from which the search for gains starts, with fallback gains.
 
     Attributes:
         identified: The axes.
         before: Raw gains of the drives before the run, (num_axes, count).
-        reference: Those of the baseline rule, likewise.
-        calm: Those that are slow enough for any load, with which what is stopped goes on, likewise.
-        unsafe: Why an axis must not be moved with the gains before, "" where it may, (num_axes,).
+        reference: Gains of the baseline rule, (num_axes, count).
+        calm: Gains slow enough for any load, for axes that were stopped, (num_axes, count).
+        unsafe: Why an axis must not be moved with the gains before, "" if it may, (num_axes,).
     """
 
     identified: IdentifiedAxes
@@ -60,14 +60,14 @@ class Basis:
     unsafe: Texts
 
     def held(self) -> tuple[Floats, Floats]:
-        """Return the currents that a weight takes, and dry friction at least [A], 0 where not known, (num_axes,)."""
+        """Return the current of a weight, and the least current of dry friction [A], 0 if unknown, (num_axes,) each."""
         found = [None if one is None else one.estimates for one in self.identified.found]
         weight = np.array([0.0 if one is None else one["offset"].value for one in found])
         friction = np.array([0.0 if one is None else one["coulomb"].low for one in found])
         return np.nan_to_num(weight), np.maximum(np.nan_to_num(friction), 0.0)
 
     def trial_reach(self, bench: AutoBench) -> Floats:
-        """Return for what reach moves are planned that do not overcharge the DC link [rad], (num_axes,)."""
+        """Return the reach for which to plan moves that do not overcharge the DC link [rad], (num_axes,)."""
         motor, plants = bench.target.motor, self.identified.plants
         inertia = np.array([motor.inertia if plant is None else plant.inertia for plant in plants])
         return trial_reach(bench.target, inertia, self.held()[0], longer_way(*bench.room()))
@@ -75,26 +75,26 @@ class Basis:
 
 @dataclass(frozen=True)
 class RecordedGains:
-    """Gains of all axes, and what is known of them: from trials, a move, a frequency response and a load step.
+    """Gains of all axes, with results of trials, a move, a frequency response and a load step.
 
     Attributes:
         gains: Raw, (num_axes, count).
-        proof: J by measured terms of their trial, (num_axes,); nan where there is none.
-        verified: How they were verified, in words, (num_axes,); "" where they were not.
-        cost: Robust cost on the digital twins, (num_axes,); nan where it is not known.
-        failed: Of each axis, why its gains cannot stay: it failed the move, or does not come to rest; "" if they can.
-        swing: Of its current at rest without the noise of its measurement, over the rated one (RMS), (num_axes,).
-        unseen: Of each axis, why it has no usable frequency response; "" where it has one.
-        slack: How far the measured loops keep the dynamics, relative, (num_axes,); nan where they were not measured.
-        overshoot: Of a step of the set-point in csp, over the step, (num_axes,); nan where none was made.
+        proof: J by measured terms of their trial, (num_axes,); nan without one.
+        verified: How they were verified, (num_axes,); "" if they were not.
+        cost: Robust cost on the digital twins, (num_axes,); nan if unknown.
+        failed: Why the gains of each axis are rejected: a failed move, or no rest; "" if they may stay.
+        swing: Current at rest without measurement noise, over the rated one (RMS), (num_axes,).
+        unseen: Why each axis has no usable frequency response; "" if it has one.
+        slack: Relative slack of the measured loops to the dynamics, (num_axes,); nan if not measured.
+        overshoot: Overshoot of a set-point step in csp, over the step, (num_axes,); nan if not made.
         kept: Axes that keep the gains before, (num_axes,).
-        most: Velocity P halfway to gains that were stopped in a trial, raw, (num_axes,); infinite where none were.
-        shown: A recorded move, None if none was made.
-        earlier: A recorded move with the gains before, None if none was made.
-        response: The velocity loop's, None if none was measured.
-        loaded: Response to a load step, of emulated machines.
-        margins: Of the outer loops as measured, "velocity" and "position", by axis; nothing where nothing was.
-        at_least: Lower bounds of margins that were not measured, likewise.
+        most: Velocity P half way to gains that were stopped in a trial, raw, (num_axes,); infinite without any.
+        shown: A recorded move; None without one.
+        earlier: A recorded move with the gains before; None without one.
+        response: Frequency response of the velocity loop; None without one.
+        loaded: Responses to a load step, of emulated machines, by axis.
+        margins: Measured margins of the outer loops, "velocity" and "position", by axis; empty if not measured.
+        at_least: Lower bounds of margins that were not measured, by axis and loop.
     """
 
     gains: Integers
@@ -117,7 +117,7 @@ class RecordedGains:
 
     @staticmethod
     def only(gains: Integers) -> RecordedGains:
-        """Return gains of which nothing is known, (num_axes, count)."""
+        """Return a record of gains without any results, (num_axes, count)."""
         n = len(gains)
         unknown, nothing = np.full(n, np.nan), np.full(n, "", object)
         return RecordedGains(
@@ -126,7 +126,7 @@ class RecordedGains:
         )  # fmt: skip
 
     def mixed(self, other: RecordedGains, where: Mask) -> RecordedGains:
-        """Return this with all that another one has of some axes, (num_axes,)."""
+        """Replace all data of some axes, (num_axes,), by those of another record."""
         names = ("proof", "verified", "cost", "failed", "swing", "unseen", "slack", "overshoot", "kept", "most")
         values: dict[str, Any] = {name: np.where(where, getattr(other, name), getattr(self, name)) for name in names}
         shown, response = self.shown, self.response

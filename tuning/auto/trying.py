@@ -1,4 +1,4 @@
-"""Trials of designed gains on the drives: where they fail, of lower ones."""
+"""Trials of designed gains on the drives, and of lower gains if they fail."""
 
 from __future__ import annotations
 
@@ -20,25 +20,26 @@ if TYPE_CHECKING:
     from tuning.auto.bench import AutoBench
     from tuning.auto.stages import Basis
 
-BY_TRIAL = "by a move, its reversal, and a move with 1.5 times velocity P"  # how gains are verified, at the least
-SLOWER = 0.6  # what gains that fail their trial are lowered to
-WINDOW = 10  # following error that trips a trial, over its move: a slow loop lags by the whole of it
+BY_TRIAL = "by a move, its reversal, and a move with 1.5 times velocity P"  # how gains are verified at least
+SLOWER = 0.6  # factor by which gains that fail their trial are lowered
+WINDOW = 10  # following error that trips a trial, over its move: a slow loop lags by the whole move
 
 
 def try_gains(bench: AutoBench, basis: Basis, gains: Integers, cost: Floats) -> RecordedGains:
-    """Try designed gains on the drives; where they fail, lower ones, and at last those that any load bears.
+    """Try designed gains on the drives; if they fail, lowered ones, then gains that are slow enough for any load.
 
     Args:
         bench: The drives.
-        basis: What is known of them.
-        gains: As designed, (num_axes, count).
+        basis: The identified axes, with calm gains.
+        gains: Designed gains, (num_axes, count).
         cost: Their robust cost on the digital twins, (num_axes,).
     """
     ground, n = proving_ground(bench, basis), bench.target.num_axes
     watch_following(bench, bench.going)
     bench.stop(bench.going & ground.too_short(), "the travel is too short for a trial move")
     known = bench.target.device.gains
-    # Position P is the first to give way: on an axis of more inertia than was found its loop would be the faster one.
+    # Position P is lowered most: on an axis with more inertia than identified its loop would be too fast for the inner
+    # one.
     slower = known.scaled(faster(known, gains, SLOWER), SLOWER, known.columns_of("position"))
     best, proof, last = basis.calm.copy(), np.full(n, np.nan), [""] * n
     stopped = np.zeros(n, bool)  # with the designed gains
@@ -77,25 +78,25 @@ def try_gains(bench: AutoBench, basis: Basis, gains: Integers, cost: Floats) -> 
 
 
 def proving_ground(bench: AutoBench, basis: Basis) -> ProvingGround:
-    """Set and return where gains are tried, from where the axes are now."""
+    """Create the proving ground with the present positions of the axes, and store it in the bench."""
     plants = basis.identified.plants
     bench.ground = ProvingGround(bench.target, plants, bench.room(), basis.calm, basis.reference, basis.held())
     return bench.ground
 
 
 def watch_following(bench: AutoBench, where: Mask) -> None:
-    """Set a following error limit that no normal trial reaches."""
+    """Set a following error window that no normal trial exceeds."""
     drives = bench.target.drives
     window = WINDOW * np.abs(bench.ground.move.distance) + drives.read(Role.POSITION_SCALE)
     drives.write(cia402.FOLLOWING_WINDOW, window, where=where)
 
 
 def between(known: GainSet, passed: Integers, stopped: Integers) -> Floats:
-    """Return the velocity P halfway from gains that passed a trial to those that were stopped, raw, (num_axes,)."""
+    """Return the velocity P half way between gains that passed a trial and stopped ones, raw, (num_axes,)."""
     column = known.column("velocity", "P")
     return np.asarray(np.floor(np.sqrt(passed[:, column].astype(float) * stopped[:, column])))
 
 
 def faster(known: GainSet, gains: Integers, factor: float) -> Integers:
-    """Return gains of shape (..., count) with those of the outer loops times a factor."""
+    """Scale the outer loops' gains, of shape (..., count), by a factor."""
     return known.scaled(gains, factor, known.columns_of("velocity", "position"))

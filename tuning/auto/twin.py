@@ -1,9 +1,9 @@
 """Digital twins: emulated machines with the identified parameters, on which trials of gains take no drive time.
 
-A twin is the generic machine that identification can know: a rotor with a disc, rigid or on one spring, with dry and
-viscous friction, the identified winding and velocity filter, and the encoder and power stage of the data sheets. Gains
-are scored on it by the robust cost (drive_env/trials/score.py), many at once as machines; on a real axis the robust
-cost cannot be measured.
+A twin is the generic machine that can be identified: a rotor with a disc, rigid or on one spring, with dry and viscous
+friction, the identified winding and velocity filter, and the encoder and power stage of the data sheets. It scores
+gains by the robust cost (drive_env/trials/score.py), many at once as machines; the robust cost cannot be measured on a
+real axis.
 """
 
 from __future__ import annotations
@@ -30,24 +30,24 @@ if TYPE_CHECKING:
     from drive_env.motors import Motor
     from tuning.identify.identified_axis import Identification
 
-# What a search may go down to. Without an integral part a constant load leaves an error for ever, which outlasts the
-# quarter of a second that the robust cost looks at.
+# Bound of a search. Without an integral part a constant load leaves a permanent error, which the robust cost with its
+# quarter of a second does not detect.
 LONGEST_INTEGRATION = 0.65536  # s, of the velocity loop
-FASTEST_RESONANCE = 500.0  # Hz; a faster one is taken as rigid: the physics' step does not resolve it
-MOST_RESONANCE = 1.1 * FASTEST_RESONANCE  # Hz, of a variant
-LEAST_LOAD = 0.05  # of the total inertia: what is left for a load where the rotor's data sheet value takes all
-LEAST_RATIO = 1.03  # of resonance over anti-resonance: nearer to each other they cancel
-BREAKAWAY = 1.5  # over sliding friction, of bearings
+FASTEST_RESONANCE = 500.0  # Hz; a faster one is modelled as rigid, since the physics' step does not resolve it
+MOST_RESONANCE = 1.1 * FASTEST_RESONANCE  # Hz, in a variant
+LEAST_LOAD = 0.05  # of the total inertia: least load, if the rotor's data sheet value is as large as the total
+LEAST_RATIO = 1.03  # of resonance over anti-resonance: with a smaller ratio they cancel each other
+BREAKAWAY = 1.5  # static over sliding friction, of bearings
 SLOWEST_FILTER = 50.0  # Hz
-UNKNOWN_FILTER = 0.5  # relative: how far a velocity filter may be off that was not identified
+UNKNOWN_FILTER = 0.5  # relative: assumed uncertainty of a velocity filter that was not identified
 
 
 class Known(NamedTuple):
-    """The data of a twin: the axis, and how far its rotor may turn, with the sign [rad].
+    """The data of a twin: the axis, and the signed angle that its rotor may turn [rad].
 
-    coulomb, viscous: Its friction at the rotor, dry [A] and viscous [A*s/rad], as identified. offset: Current that
-    gravity or another constant load takes [A]. spread: Half widths of the 95 % intervals of what a variant of the
-    machine may deviate in, relative.
+    coulomb, viscous: Identified friction at the rotor, dry [A] and viscous [A*s/rad].
+    offset: Current that gravity or another constant load takes [A].
+    spread: Relative half widths of the 95 % intervals of quantities that variants of the machine vary.
     """
 
     plant: Plant
@@ -59,12 +59,12 @@ class Known(NamedTuple):
 
 
 def known_of(plant: Plant, identified: Identification, reach: float) -> Known:
-    """Return the data of a twin from an identification; friction that was not identified counts as none.
+    """Return the data of a twin from an identification; friction that was not identified counts as 0.
 
     Args:
         plant: The axis model.
-        identified: What was identified.
-        reach: How far the rotor may turn, with the sign [rad].
+        identified: The identification.
+        reach: Signed angle that the rotor may turn [rad].
     """
     known = {name: one for name, one in identified.estimates.items() if one.is_known}
     dry, viscous, offset = (known[name].value if name in known else 0.0 for name in ("coulomb", "viscous", "offset"))
@@ -75,10 +75,10 @@ def known_of(plant: Plant, identified: Identification, reach: float) -> Known:
 
 
 class MachineVariant(NamedTuple):
-    """A variant of the machine within what identification leaves open; gains must be good on all of them.
+    """A variant of the machine within the uncertainty of identification; gains must be good on all variants.
 
-    inertia, anti_resonance, resonance, velocity_filter: Deviation from the identified value, relative; at least that of
-        its interval.
+    inertia, anti_resonance, resonance, velocity_filter: Relative deviation from the identified value; the half width of
+        its interval is used if that is larger.
     """
 
     name: str
@@ -86,8 +86,8 @@ class MachineVariant(NamedTuple):
     anti_resonance: float = 0.0
     resonance: float = 0.0
     velocity_filter: float = 0.0
-    damping: float = 1.0  # over what was identified or taken
-    friction: float = 1.0  # dry, over what was identified
+    damping: float = 1.0  # over the identified or assumed one
+    friction: float = 1.0  # dry, over the identified one
     adc_noise: float | None = None  # A
     cogging: float = 1.0  # over the data sheet's
     supply_resistance: float | None = None  # ohm
@@ -96,18 +96,18 @@ class MachineVariant(NamedTuple):
 UNCERTAIN = ("inertia", "anti_resonance", "resonance", "velocity_filter")
 WORLDS = (
     MachineVariant("as identified"),
-    # Dry friction holds a shaking axis still, and is what two short moves tell worst: drag and sticking pass for it.
+    # Dry friction can stop an oscillating axis; two short moves overestimate it, since drag and sticking look like it.
     MachineVariant(
         "rough", 0.05, -0.04, -0.03, -0.1, 0.7, friction=0.4, adc_noise=0.05, cogging=1.7, supply_resistance=0.15
     ),
     MachineVariant("smooth", -0.05, 0.03, 0.04, 0.1, damping=1.5, adc_noise=0.01, cogging=0.5),
 )
-MOST_SWING = 0.8 * OSCILLATION  # what the current may swing in a move, of the rated one
-FARTHEST = 0.6  # relative: an interval that says less than this says nothing
+MOST_SWING = 0.8 * OSCILLATION  # greatest swing of the current in a move, over the rated one
+FARTHEST = 0.6  # relative: a wider interval carries no information
 
 
 def is_elastic(plant: Plant) -> bool:
-    """Return whether a twin of this axis has a spring."""
+    """Return whether the twin of this axis has a spring."""
     return plant.anti_resonance < plant.resonance < FASTEST_RESONANCE
 
 
@@ -116,14 +116,14 @@ def twin_parameters(
 ) -> dict[str, float]:
     """Return the parameters of the emulated machine (one inertia or two masses) that matches the identification.
 
-    The torque constant is the data sheet's: inertia and friction are identified relative to it, so it does not matter.
+    The torque constant is the data sheet's: inertia and friction are identified relative to it, so its error cancels.
 
     Args:
         device: The drive.
         motor: Its motor.
         known: The axis.
-        world: What is different from it.
-        lightest: The least load inertia that the robust cost makes of it, over its own.
+        world: Variant of the machine.
+        lightest: Least load inertia in the variants of the robust cost, over its own.
     """
     plant = known.plant
     off = {name: _factor(getattr(world, name), known.spread.get(name, 0.0)) for name in UNCERTAIN}
@@ -135,7 +135,7 @@ def twin_parameters(
         for name, value in (("adc_noise", world.adc_noise), ("supply_resistance", world.supply_resistance))
     )
     values = {
-        "motor.R_s": plant.R,  # what was measured is winding and stage
+        "motor.R_s": plant.R,  # measured: winding and stage together
         "stage.on_resistance": 0.0,
         "motor.L_d": plant.L,
         "motor.L_q": plant.L,
@@ -147,7 +147,7 @@ def twin_parameters(
     if is_elastic(plant):
         rotor = total * (anti_resonance / resonance) ** 2
         load = total - rotor
-        # The variants of the robust cost have less load on the same spring: the physics' step must resolve them, too.
+        # Variants of the robust cost have less load on the same spring: the physics' step must resolve these, too.
         most = (2.0 * math.pi * MOST_RESONANCE) ** 2 / (1.0 / rotor + 1.0 / (lightest * load))
         stiffness = min(load * (2.0 * math.pi * anti_resonance) ** 2, most)
         values["load.stiffness"] = stiffness
@@ -158,7 +158,7 @@ def twin_parameters(
     values |= {"motor.inertia": rotor, "load.inertia": load}
     dry = known.coulomb * motor.torque_constant * world.friction
     viscous = known.viscous * motor.torque_constant
-    # The bearings of the data sheet are the motor's, what is more belongs to the load.
+    # Friction up to the data sheet's belongs to the motor's bearings, the rest to the load.
     values["motor.coulomb"] = min(dry, motor.coulomb)
     values["load.coulomb"] = dry - values["motor.coulomb"]
     values["load.breakaway"] = BREAKAWAY * values["load.coulomb"]
@@ -168,23 +168,23 @@ def twin_parameters(
 
 
 def _factor(way: float, spread: float) -> float:
-    """Return the value of a variant, of a value known to within a relative half width."""
+    """Return the factor of a variant on a value with a known relative half width."""
     return 1.0 + math.copysign(max(abs(way), min(spread, FARTHEST)), way) if way else 1.0
 
 
 class Twins:
-    """Judges gains on twins, `sets` sets of gains for every axis at once.
+    """Judges gains on twins: `sets` sets of gains for every axis at once.
 
     Args:
         device: The drive.
-        motor: The motor, as its data sheet has it.
-        known: The data of each axis, n of them.
+        motor: The motor with its data sheet values.
+        known: Data of each of the n axes.
         scaler: 2058h of each axis, shape (n,).
         sets: Sets of gains per axis that are judged at once.
-        num_threads: Threads that run them; the number of cores by default.
+        num_threads: Number of threads; the number of cores by default.
         worlds: Variants on which the gains are judged.
-        repeats: Runs of each variant, with a noise of their own, whose scores are averaged.
-        dynamics: What the loops must keep.
+        repeats: Runs of each variant, each with its own noise, whose scores are averaged.
+        dynamics: Requirements on the loops.
     """
 
     def __init__(
@@ -201,7 +201,7 @@ class Twins:
     ) -> None:
         self.device, self.sets, self.dynamics = device, sets, find_dynamics(dynamics)
         self.num_axes, self._worlds = len(known), len(worlds)
-        self._parts: list[tuple[Integers, RobustScore]] = []  # those of a load: which axes they are, and their score
+        self._parts: list[tuple[Integers, RobustScore]] = []  # for each load: its axes, and their score
         elastic = np.array([is_elastic(one.plant) for one in known])
         lightest = self.dynamics.inertia_range[0]
         for load, mask in (("inertia", ~elastic), ("two_mass", elastic)):
@@ -220,7 +220,7 @@ class Twins:
                 {name: np.repeat(values, sets, axis=0).reshape(-1) for name, values in columns.items()},
                 self._each([one.plant.supply for one in chosen]),
             )
-            # What the motor must push for is what the load pulls.
+            # The motor pushes against the pull of the load.
             robust.set_constant_load(self._each([-one.offset * motor.torque_constant for one in chosen]))
             inertia, reach = [one.plant.inertia for one in chosen], [one.reach for one in chosen]
             move = plan_move(motor, inertia, scaler[mask], reach, highest_ramp(device))
@@ -228,14 +228,14 @@ class Twins:
             robust.set_moves(Move(distance, velocity, acceleration, increments, move.counts))
 
     def _each(self, values: ArrayLike) -> NDArray[Any]:
-        """Return values of axes, (axes,), for all their machines: sets of gains, and of each the worlds."""
+        """Repeat values of axes, (axes,), for all machines: each axis has its sets of gains, each set its variants."""
         return np.repeat(np.asarray(values), self.sets * self._worlds)
 
     def judge(self, gains: Integers) -> tuple[Floats, Floats]:
-        """Return the robust performance of gains over the worlds, and how far they keep the constraints.
+        """Return the robust performance of gains over the variants, and their slack to the constraints.
 
-        The mean performance of all worlds counts, and the margins of the first; gains that a trial would stop as
-        oscillating keep no constraints.
+        The performance is the mean over all variants, the margins are those of the first; gains that a trial would stop
+        because of oscillation have a negative slack.
 
         Args:
             gains: Raw, (n, any sets, count).
@@ -256,7 +256,7 @@ class Twins:
         shape = (*gains.shape[:2], self._worlds)
         scores = robust.score(np.repeat(gains.reshape(-1, gains.shape[-1]), self._worlds, axis=0))
         worth = np.exp(np.log(scores.performance).reshape(shape).mean(axis=2))
-        # A drive on which that swings would be stopped: a trial sees the move and the probe.
+        # A real drive would be stopped at this swing: a trial watches the move and the probe.
         swing = scores.swing.max(axis=1).reshape(shape).max(axis=2)
         calm = 1.0 - np.minimum(swing / MOST_SWING, 1.0 - TRIPPED)
         return np.array([worth, np.minimum(scores.slack.reshape(shape)[:, :, 0], calm)])
@@ -272,7 +272,7 @@ def gain_bounds(device: Device) -> tuple[Integers, Integers]:
     least, most = np.minimum(device.gains.lowest, 1), device.gains.highest
     integral = device.gains.column("velocity", "I")
     if integral is not None:
-        scale = si_scales(device, 1.0)["velocity", "I"]  # which no supply changes
+        scale = si_scales(device, 1.0)["velocity", "I"]  # independent of the supply
         longest = max(round(float(scale.raw(1.0 / LONGEST_INTEGRATION))), 1)
         (most if device.gains.rows[integral].is_time else least)[integral] = longest
     return least, most

@@ -1,1 +1,1 @@
-"""Certificates: results and changes of a tuning, with the proof."""
+"""Certificates: results and changes of a tuning, with the measurements that prove them."""

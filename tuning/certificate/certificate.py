@@ -1,7 +1,7 @@
 """The certificate of a tuning: identified values, changes and measurements, with a hash that shows later changes.
 
-The hash is over the content, not over the file: indented otherwise or with its keys in another order it is the same
-certificate. It shows accidental changes; it is not a signature.
+The hash is over the content, not the file: other indentation or order of keys gives the same hash. It detects
+accidental changes; it is not a signature.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from tuning.target import Target
 
 FORMAT = 3
-STEPPER_FORMAT = "stepper 1"  # of stepper-certificate.json, which tuning/stepper/result.py writes
+STEPPER_FORMAT = "stepper 1"  # of stepper-certificate.json, written by tuning/stepper/result.py
 HASH = "sha256"
 
 
@@ -39,7 +39,7 @@ VERDICTS = ("accepted", "accepted with reservations", "rejected")
 
 
 def verdict(accepted: bool, reservations: Sequence[str]) -> str:
-    """Return which of `VERDICTS` an axis has."""
+    """Return the entry of `VERDICTS` that applies to an axis."""
     return VERDICTS[2] if not accepted else VERDICTS[1] if reservations else VERDICTS[0]
 
 
@@ -52,14 +52,14 @@ class StepResponse:
     """A recorded move of one axis.
 
     Attributes:
-        name: What was done, e.g. "velocity step 500 rpm" or "reversal".
-        tuned: Whether with the new gains; else with those before.
+        name: Name of the move, e.g. "velocity step 500 rpm" or "reversal".
+        tuned: True if recorded with the new gains, False with those before.
         unit: Unit of `reference` and `actual`.
         t: Sample times [s], shape (n,).
         reference, actual: Set-point and actual value, shape (n,).
         current: Actual current [A, peak i_q], shape (n,).
-        figures: Results: name with unit, e.g. "settling [s]", "overshoot [%]", "greatest dip [turns]" -> value;
-            nan for one that does not apply. A disturbance exists on the emulator only.
+        figures: Results: name with unit, e.g. "settling [s]", "overshoot [%]", "greatest dip [turns]" -> value; nan for
+            one that does not apply. Disturbances exist in the emulator only.
     """
 
     name: str
@@ -74,16 +74,16 @@ class StepResponse:
 
 @dataclass(frozen=True)
 class FrequencyResponse:
-    """An open loop of one axis.
+    """The frequency response of an open loop of one axis.
 
     Attributes:
-        name: Which, e.g. "velocity loop".
-        tuned: Whether with the new gains; else with those before.
-        frequency: [Hz], shape (n,).
-        magnitude_db, phase_deg: Of the open loop as measured, shape (n,).
-        coherence: 0 to 1, shape (n,); nan where it is a model's.
+        name: Name of the loop, e.g. "velocity loop".
+        tuned: True if measured with the new gains, False with those before.
+        frequency: Frequencies [Hz], shape (n,).
+        magnitude_db, phase_deg: Measured open loop, shape (n,).
+        coherence: 0 to 1, shape (n,); nan for values of a model.
         margins: Results: name with unit, e.g. "phase margin [deg]" -> value.
-        source: How it was obtained, e.g. "multisine over the bus" or "the emulator's trace".
+        source: Origin of the data, e.g. "multisine over the bus" or "the emulator's trace".
     """
 
     name: str
@@ -98,7 +98,7 @@ class FrequencyResponse:
 
 @dataclass(frozen=True)
 class StatedParameter:
-    """An identified value with its 95 % confidence interval; one not identified is nan, with the reason."""
+    """An identified value with its 95 % confidence interval; nan with the reason if it was not identified."""
 
     value: float
     low: float
@@ -110,18 +110,18 @@ class StatedParameter:
 KEPT, NEARLY_KEPT, NOT_KEPT, NOT_MEASURED = (
     "kept", "kept within the error of the measurement", "not kept", "not measured",
 )  # fmt: skip
-SEEN_KEPT = "kept where it was measured"  # a peak may lie where it was not
+SEEN_KEPT = "kept where it was measured"  # a peak may lie where it was not measured
 
 
 @dataclass(frozen=True)
 class Requirement:
-    """A requirement of the dynamics, and the axis' value.
+    """A requirement of the dynamics, and the value that the axis has.
 
     Attributes:
-        name: What is asked for, with its unit, e.g. "velocity loop, phase margin [deg]".
-        asked: The least, of Ms and overshoot the most.
-        found: What was measured; nan where nothing was.
-        is_bound: Whether `found` is a lower bound by a model, not a measurement.
+        name: Name with unit, e.g. "velocity loop, phase margin [deg]".
+        asked: The limit: greatest value for Ms and overshoot, least value for all others.
+        found: Measured value; nan if not measured.
+        is_bound: True if `found` is a lower bound computed with a model, not a measurement.
         kept: One of `KEPT`, `NEARLY_KEPT`, `SEEN_KEPT`, `NOT_KEPT` and `NOT_MEASURED`.
     """
 
@@ -137,12 +137,12 @@ TAKEN = "taken"
 
 @dataclass(frozen=True)
 class Correction:
-    """Gains that gave way to others since the drive showed something else than was designed.
+    """Gains that were replaced because the drive did not behave as designed.
 
     Attributes:
         old, new: Raw integers in the order of the device's gain set.
-        reason: What the drive showed with the old ones.
-        outcome: What came of the new ones, `TAKEN` where they stay.
+        reason: Behaviour of the drive with the old gains.
+        outcome: Result of the new gains; `TAKEN` if they stay.
     """
 
     old: tuple[int, ...]
@@ -157,21 +157,21 @@ class AxisCertificate:
 
     Attributes:
         axis: Number of the axis.
-        accepted: Whether the new gains passed the checks and are in the drive; else those before are.
-        reason: Why it was rejected, or how it was verified, in words; never empty.
-        reservations: What could not be checked, or is near a limit.
+        accepted: True if the new gains passed the checks and are in the drive; otherwise it has those before.
+        reason: Why it was rejected, or how it was verified; never empty.
+        reservations: Properties that could not be checked or are close to a limit.
         identified: Name -> parameter.
         before, after: Raw integers in the order of the device's gain set, of the drive before and now.
-        before_si, after_si: The same in SI, as `si_gains` has them: name with unit -> value.
+        before_si, after_si: The same in SI units, as returned by `si_gains`: name with unit -> value.
         steps: Recorded moves.
         frequency_responses: Open loops.
-        dynamics: Name of the dynamics that were asked for, or their numbers.
-        requirements: What these ask for, and whether it is kept.
+        dynamics: Name of the requested dynamics, or their numbers.
+        requirements: Requirements of these dynamics, and whether they are kept.
         figures: The `CROSSOVERS` of the loops; nan without a crossover.
-        corrections: Which gains gave way to which, and why, in their order.
-        notes: What no integer reached, limits met, what was left out.
+        corrections: Replaced gains in their order, with reasons.
+        notes: Gains limited by the range of integers, other limits reached, and omitted steps.
         hardware_seconds: Time that passed on the drive [s].
-        aborts: Trials that were stopped.
+        aborts: Number of stopped trials.
     """
 
     axis: int
@@ -195,7 +195,7 @@ class AxisCertificate:
 
     @property
     def verdict(self) -> str:
-        """Which of `VERDICTS` it is."""
+        """The entry of `VERDICTS` that applies to the axis."""
         return verdict(self.accepted, self.reservations)
 
 
@@ -205,14 +205,14 @@ class Certificate:
 
     Attributes:
         tuner: Name of the tuner, e.g. "auto".
-        device, motor: Names.
-        machine: An emulated load's name, or the bus and its node-IDs.
+        device, motor: Their names.
+        machine: The emulated load's name, or the bus and its node-IDs.
         supply: Supply voltage as entered [V].
-        seed: Of everything random.
+        seed: Seed of everything random.
         envelope: Limits during the tuning: name with unit -> value, e.g. "speed [rad/s]", "travel low [rad]".
         axes: One entry per axis.
-        versions: Of the packages that computed it, and the hash of each of its user's files that it is of.
-        created: When [ISO 8601, UTC].
+        versions: Versions of the packages used, and the hash of each of the user's files.
+        created: Date and time of creation [ISO 8601, UTC].
     """
 
     tuner: str
@@ -227,7 +227,7 @@ class Certificate:
     created: str = field(default_factory=lambda: datetime.now(UTC).isoformat(timespec="seconds"))
 
     def content(self) -> dict[str, Any]:
-        """Return the certificate as JSON has it, without its hash; nan is null, infinity a text."""
+        """Return the certificate as plain JSON values, without its hash; nan becomes null, infinity a text."""
         found: dict[str, Any] = _plain(self)
         return {"format": FORMAT} | found
 
@@ -236,11 +236,11 @@ class Certificate:
         return content_hash(self.content())
 
     def to_json(self) -> str:
-        """Return the file's text."""
+        """Return the text of the file."""
         return json.dumps(self.content() | {HASH: self.hash()}, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
 
 
-# --- from what tuners have --------------------------------------------------------------------------------------------
+# --- parts of a certificate from the results of tuners ----------------------------------------------------------------
 SI_UNITS = {  # of a gain by its loop and part, in the order of `SiGains`
     ("current", "P"): "V/A",
     ("current", "I"): "s",
@@ -266,14 +266,14 @@ MARGIN_NAMES = {
 
 
 def identified(identification: Identification, motor: Motor) -> dict[str, StatedParameter]:
-    """Return the identified parameters for a certificate, without a tuner's guesses, and the load's inertia ratio.
+    """Return the identified parameters for a certificate, without assumed values, and the load's inertia ratio.
 
-    That is the identified total inertia less the rotor's, over the rotor's as its data sheet has it.
+    The ratio is the identified total inertia less the rotor's, over the rotor's by its data sheet.
     """
     told = identification.estimates if identification.told is None else identification.told
     found = {name: StatedParameter(*estimate) for name, estimate in told.items()}
     if (total := found.get("inertia")) is not None:
-        # What a measurement is off may leave less than the rotor.
+        # A measurement error may make the total less than the rotor's.
         value, low, high = (
             float(np.maximum(J / motor.inertia - 1.0, 0.0)) for J in (total.value, total.low, total.high)
         )
@@ -282,9 +282,9 @@ def identified(identification: Identification, motor: Motor) -> dict[str, Stated
 
 
 def si_gains(device: Device, supply: float, gains: Iterable[int]) -> dict[str, float]:
-    """Return gains of a device's set in SI, with their units in the names; empty without a PI cascade.
+    """Convert gains of a device's set to SI units, with the units in the names; empty without a PI cascade.
 
-    For an I gain the integration time T_i is given.
+    An I gain is given as its integration time T_i.
     """
     from drive_env.devices.gains import PI, gains_in_si
 
@@ -301,7 +301,7 @@ def _si_name(gain: Gain) -> str:
 
 
 def envelope(target: Target) -> dict[str, float]:
-    """Return the limits of a target, for each axis."""
+    """Return the limits of a target for each axis."""
     rows = {
         "travel low [rad]": target.low,
         "travel high [rad]": target.high,
@@ -325,9 +325,10 @@ def frequency_response(
     coherence: ArrayLike | None = None,
     source: str = "",
 ) -> FrequencyResponse:
-    """Return an open loop, complex of shape (n,) at frequencies [Hz], for a certificate; nan was not measured.
+    """Return the frequency response of an open loop for a certificate.
 
-    `at_least` has lower bounds of margins that were not measured.
+    `open_loop` is complex, shape (n,), at the frequencies `f` [Hz]; nan means not measured. `at_least` has lower bounds
+    of margins that were not measured.
     """
     L = np.asarray(open_loop, complex)
     seen = np.isfinite(L) & (L != 0.0)
@@ -357,7 +358,7 @@ def _bounds(margins: Margins, least: AtLeast | None) -> dict[str, float]:
 
 
 def _plain(value: Any) -> Any:
-    """Return a value as JSON can have it."""
+    """Convert a value to plain JSON types."""
     if is_dataclass(value):
         return {f.name: _plain(getattr(value, f.name)) for f in fields(value)}
     if isinstance(value, Mapping):

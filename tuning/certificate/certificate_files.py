@@ -1,4 +1,4 @@
-"""A certificate's files: written together with its report, read back to the last digit, and checked by their hashes."""
+"""A certificate's files: written together with its report, read without loss of digits, and checked by their hashes."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def certificate_files(
 
 
 def load_certificate(path: str | Path) -> tuple[Certificate, bool]:
-    """Return the certificate of a JSON file, and whether it is unchanged since it was written.
+    """Read a certificate from a JSON file; return it and whether its hash is correct.
 
     Raises:
         CertificateError: If the file is not a certificate.
@@ -51,10 +51,10 @@ def load_certificate(path: str | Path) -> tuple[Certificate, bool]:
 
 
 def is_unchanged(path: str | Path) -> bool:
-    """Return whether a certificate.json, a stepper-certificate.json or a report.html is as it was written.
+    """Return whether a certificate.json, a stepper-certificate.json or a report.html is unchanged since it was written.
 
     Raises:
-        CertificateError: If the file is another one.
+        CertificateError: If it is another kind of file.
     """
     where = Path(path)
     if where.suffix == ".html":
@@ -85,7 +85,7 @@ def _text(path: Path) -> str:
 
 
 def _built(kind: Any, data: Mapping[str, Any]) -> Any:
-    """Return a dataclass from the plain data of `_plain`."""
+    """Build a dataclass from the plain data of `_plain`."""
     kinds = get_type_hints(kind)
     return kind(**{f.name: _value(kinds[f.name], data[f.name]) for f in fields(kind)})
 

@@ -15,14 +15,14 @@ from tuning.response.bode import PHASES, draw_margins, within_a_turn
 if TYPE_CHECKING:
     from tuning.certificate.certificate import FrequencyResponse, StepResponse
 
-TRUSTED = 0.95  # coherence; what lies below is shown as doubtful, not as truth
+TRUSTED = 0.95  # coherence; samples below are drawn in grey
 BEFORE, AFTER, DOUBTFUL = "#d55e00", "#0072b2", "#b8b8b8"
 DPI = 110
 MARGINS = ("phase margin at [Hz]", "phase margin [deg]", "gain margin at [Hz]", "gain margin [dB]")
 
 
 def step_picture(steps: Sequence[StepResponse]) -> Figure:
-    """Return a picture of set-point, actual value and current of one move, with one or several sets of gains."""
+    """Draw set-point, actual value and current of one move, recorded with one or several sets of gains."""
     figure = Figure(figsize=(8.0, 4.8), dpi=DPI, layout="constrained")
     motion, current = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
     for step in steps:
@@ -41,7 +41,7 @@ def step_picture(steps: Sequence[StepResponse]) -> Figure:
 
 
 def bode_picture(responses: Sequence[FrequencyResponse]) -> Figure:
-    """Return a Bode diagram with coherence; curves are grey where the coherence is low."""
+    """Draw a Bode diagram with coherence; the curves are grey where the coherence is below TRUSTED."""
     figure = Figure(figsize=(8.0, 6.6), dpi=DPI, layout="constrained")
     magnitude, phase, coherence = figure.subplots(3, 1, sharex=True, height_ratios=(3, 3, 1.5))
     doubtful = False
@@ -80,7 +80,6 @@ def bode_picture(responses: Sequence[FrequencyResponse]) -> Figure:
 
 
 def _curve(axes: Axes, f: np.ndarray, y: np.ndarray, trusted: np.ndarray, color: str, label: str) -> None:
-    """Draw a curve, in grey where the coherence is low."""
     axes.plot(f, y, color=DOUBTFUL, linewidth=1.0)
     axes.plot(f, np.where(trusted, y, np.nan), color=color, linewidth=1.4, label=label)
 

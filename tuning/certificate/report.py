@@ -1,4 +1,4 @@
-"""The report of a tuning: a certificate as one HTML file with its pictures, which loads nothing else."""
+"""The report of a tuning: a certificate as one HTML file that contains its pictures."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from tuning.certificate.certificate import AxisCertificate, Certificate, Correction
 
 RATIO = CROSSOVERS[-1]
-# Usual advice, not a limit: of the best gains of single axes that keep all constraints three quarters are beyond it.
+# Usual advice, not a limit: three quarters of the best gains of single axes that keep all constraints exceed it.
 USUAL_RATIO = 0.5
 SEAL = "<!-- sha256 of all before this line: "
 
@@ -39,7 +39,7 @@ img { max-width: 100%; height: auto; } .refused { color: #777; } code { font-siz
 .reserved { color: #8a5a00; font-weight: 600; } ul.reserved { font-weight: 400; }
 """
 
-# Of a verdict: its class, and what holds then.
+# For each verdict: its CSS class, and its meaning.
 COLOURS = {
     "accepted": ("accepted", "new gains in the drive"),
     "accepted with reservations": ("reserved", "new gains in the drive, with reservations"),
@@ -48,7 +48,7 @@ COLOURS = {
 
 
 def to_html(certificate: Certificate) -> str:
-    """Return the report; its last line is a hash over all before it."""
+    """Return the report as HTML; its last line is a hash over everything before it."""
     title = f"Tuning of {certificate.device} with {certificate.motor}"
     body = [f"<h1>{escape(title)}</h1>", _summary(certificate)]
     for axis in certificate.axes:
@@ -65,10 +65,10 @@ def to_html(certificate: Certificate) -> str:
 
 
 def html_is_unchanged(text: str) -> bool:
-    """Return whether a report is as it was written.
+    """Return whether a report is unchanged since it was written.
 
     Raises:
-        CertificateError: If the text is no report.
+        CertificateError: If the text is not a report.
     """
     content, seal, stated = text.rpartition(SEAL)
     if not seal:
@@ -191,7 +191,7 @@ def _identified(axis: AxisCertificate) -> str:
 
 
 def _before_and_after(found: Sequence[tuple[bool, Mapping[str, float]]], absent: str = "–") -> str:  # noqa: RUF001
-    """Return a table of figures with a column each for the gains before and the new ones; `absent` is no figure."""
+    """Return a table of figures with one column for each set of gains; `absent` is shown for a missing figure."""
     names = list(dict.fromkeys(name for _, figures in found for name in figures))
     if not names:
         return ""
@@ -218,9 +218,9 @@ def _table(heads: Iterable[str], rows: Iterable[Sequence[str]], numbers: Iterabl
 
 
 def _figure(value: Any) -> str:
-    """Return a number with four digits; a missing one is a dash."""
+    """Format a number with four digits; nan becomes a dash."""
     number = float(value)
-    return "–" if math.isnan(number) else f"{number:.4g}"  # noqa: RUF001  # the dash that a table has
+    return "–" if math.isnan(number) else f"{number:.4g}"  # noqa: RUF001  # an en dash
 
 
 def _image(figure: Figure, text: str) -> str:

@@ -76,15 +76,15 @@ def auto(
         if by in SEARCHES:
             _search(by, drive, method, dynamics, inertia_range, out=out, store=store, dry_run=dry_run, json=json)
             return
-        asked = asked_dynamics(dynamics, drive.device, inertia_range)  # before anything is done
+        asked = asked_dynamics(dynamics, drive.device, inertia_range)  # checked before anything is done
         tell: Callable[[str], None] = (lambda line: None) if json else print
         how = open_method(by, method, drive.device, dynamics, None if drive.bus else drive.load, tell)
         folder = provenance.run_folder("auto") if out is None else out
         provenance.check_folder(folder)
         if dry_run:
-            drive.check_linear_model()  # what the commissioning of a stepper writes is not listed
+            drive.check_linear_model()  # the writes of a stepper's commissioning cannot be listed
             with drive.open_to_read() as target:
-                how.method(target)  # an agent says what it was not trained for
+                how.method(target)  # an agent prints what it was not trained for
                 tell_plan(target, how, folder, keep=store, json=json)
             return
         file = folder / BEFORE if drive.bus else None
@@ -97,7 +97,6 @@ def auto(
 def _run(
     target: Target, how: OpenedMethod, folder: Path, dynamics: Dynamics, *, seed: int, store: bool, json: bool
 ) -> Result | StepperResult:
-    """Tune drives and print the result."""
     from tuning.auto_to_files import auto_to_files, commission_to_files
 
     if target.device.gains.is_open_loop:
@@ -126,7 +125,7 @@ def _search(
     dry_run: bool,
     json: bool,
 ) -> None:
-    """Tune drives by a search, and print the result; where no certificate is possible, it is the search alone."""
+    """Tune drives by a search, and print the result; if no certificate is possible, only search."""
     from tuning.auto_to_files import BEFORE, auto_to_files
     from tuning.commands.search import open_search
     from tuning.runs import provenance, unfinished
@@ -202,7 +201,7 @@ def _report_stepper(target: Target, result: StepperResult, folder: Path, json: b
 
 
 def _not_kept(target: Target) -> str:
-    """Return the note on settings that a drive on a bus cannot store; "" where it can."""
+    """Return the note on settings that a drive on a bus cannot store; "" if it can."""
     from tuning.snapshot import can_store
 
     if not target.bus or can_store(target):
@@ -249,7 +248,7 @@ def _report(target: Target, result: Result, folder: Path, json: bool, search: Ma
     print_table(columns, cells)
     lines = []
     for k, axis, seconds in zip(numbers, result.axes, result.drive_seconds, strict=True):
-        if not axis.accepted and axis.identified is None and seconds == 0.0:  # refused at the outset
+        if not axis.accepted and axis.identified is None and seconds == 0.0:  # refused before its first move
             lines.append(f"axis {k} was not tuned: {axis.reason}")
         elif not axis.accepted:
             lines.append(f"axis {k}: rejected, and its gains from before are restored: {axis.reason}")
@@ -270,13 +269,13 @@ def _report(target: Target, result: Result, folder: Path, json: bool, search: Ma
 
 
 def _head(loop: str, titles: list[str]) -> str:
-    """Return the head of a column: the loop as the first title begins, or as it is called, and the gains in it."""
+    """Return the head of a column: the common first word of the titles, or the loop's name, and the gains below it."""
     shared = titles[0].rpartition(" ")[0]
     return f"{shared or loop}\n{', '.join(title.removeprefix(shared).strip() for title in titles)}"
 
 
 def _margins(axis: AxisResult, loop: str) -> str:
-    """Return phase and gain margin of a loop; a lower bound where one was not measured."""
+    """Format phase and gain margin of a loop; a lower bound if one was not measured."""
     found, least = axis.margins.get(loop), axis.at_least.get(loop)
     texts = []
     for key, unit in (("phase_deg", "°"), ("gain_db", " dB")):

@@ -1,4 +1,4 @@
-"""The command `drive-tune`: it assembles the commands of this folder, one file per command."""
+"""The command `drive-tune`: registers the commands of this folder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`drive-tune commission`: from a drive that knows no motor to a certificate, step by step."""
+"""`drive-tune commission`: from a factory-fresh drive to a certificate, step by step."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ ANSWERS = {"y": "do it", "s": "leave it out", "b": "back to the step before", "q
 
 @dataclass(frozen=True, kw_only=True)
 class FreshDriveOptions(DriveOptions):
-    """The same; an emulated drive is as it comes from the factory."""
+    """`DriveOptions`, but an emulated drive has its factory settings."""
 
     def machine(self) -> dict[str, Any]:
-        """Return the arguments of `tuning.target.emulated` in these options; raises as `open_target` does."""
+        """Return the options as arguments of `tuning.target.emulated`; raises as `open_target`."""
         return super().machine() | {"factory_fresh": True}
 
 
@@ -110,7 +110,7 @@ def commission(
         drive.check()
         with way_back(file, "drive-tune"), open_target(drive) as target:
             check_method(target, method)
-            raw_limits(target, plan.limits)  # before anything moves: a wrong text is told at once
+            raw_limits(target, plan.limits)  # checked before anything moves
             with CommissioningPath(target, plan, folder) as path:
                 _walk(path, chosen, yes=drive.yes, quiet=json)
         if json:
@@ -126,10 +126,10 @@ def commission(
 
 
 def _chosen(step: Sequence[str] | None, skip: Sequence[str] | None) -> set[str]:
-    """Return the steps to do.
+    """Return the names of the steps to run.
 
     Raises:
-        ValueError: For one that does not exist.
+        ValueError: For an unknown step.
     """
     from tuning.commissioning.steps import STEPS
 
@@ -140,7 +140,7 @@ def _chosen(step: Sequence[str] | None, skip: Sequence[str] | None) -> set[str]:
 
 
 def _limits(given: Sequence[str] | None) -> dict[str, str]:
-    """Return the limits that are given, by name; ValueError for a text that is no NAME=VALUE."""
+    """Parse the given limits by name; ValueError for a text that is not NAME=VALUE."""
     from tuning.commissioning.axis_limits import LIMITS
 
     found = {}
@@ -153,7 +153,7 @@ def _limits(given: Sequence[str] | None) -> dict[str, str]:
 
 
 def _walk(path: CommissioningPath, chosen: set[str], *, yes: bool, quiet: bool) -> None:
-    """Do the steps in their order, until the last one, the user's word, or a failure without a terminal."""
+    """Run the steps in order, until the last one, the user's word, or a failure without a terminal."""
     from tuning.commissioning.homing import has_no_method, no_method
     from tuning.commissioning.steps import STEPS
 
@@ -199,7 +199,7 @@ def _run(path: CommissioningPath, name: str, quiet: bool) -> StepState:
 
 
 def _answer(path: CommissioningPath, name: str) -> str:
-    """Ask what to do with a step, and for a homing method where none is chosen."""
+    """Ask the user what to do with a step, and for a homing method if none is chosen."""
     words = ", ".join(f"{key}: {what}" for key, what in ANSWERS.items())
     while (answer := typer.prompt(f"  {words}", default="y").strip().lower()[:1]) not in ANSWERS:
         pass
@@ -217,7 +217,7 @@ def _ask_method(path: CommissioningPath) -> None:
 
 
 def _before(path: CommissioningPath, name: str, chosen: set[str]) -> str:
-    """Return the step before, of those that the drive has and that were chosen; the first one has none but itself."""
+    """Return the chosen step before one, among those that the drive has; the step itself if it is the first."""
     from tuning.commissioning.steps import STEPS
 
     names = list(STEPS)
@@ -245,7 +245,7 @@ def _print_state(step: CommissioningStep, state: StepState) -> None:
 
 
 def _tell_plan(target: Target, chosen: set[str], json: bool) -> None:
-    """Print the steps, and the objects that each would write, with what the drives have now."""
+    """Print the steps, and the objects that each would write, with their present values."""
     from tuning.commissioning.path import check_off
     from tuning.commissioning.steps import STEPS
     from tuning.identify.working_state import borrowed

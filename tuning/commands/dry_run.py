@@ -1,4 +1,4 @@
-"""`drive-tune auto --dry-run`: what a run would read, move and write; drives on a bus are only read."""
+"""`drive-tune auto --dry-run`: shows what a run would read, move and write; drives on a bus are only read."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
 
 def tell_plan(target: Target, method: OpenedMethod, folder: Path, *, keep: bool, json: bool) -> None:
-    """Print the checks and the plan of a run; end with REFUSED if it would not start.
+    """Print the checks and the plan of a run; exit with REFUSED if it would not start.
 
     Args:
-        target: The drives; those of a bus are read over SDO, and neither written nor enabled.
-        method: What would find the gains.
-        folder: Where the run would write its files.
-        keep: Whether the run would have the drives keep the gains over a power cycle.
-        json: Print JSON in place of lines.
+        target: The drives; those of a bus are read by SDO, and neither written nor enabled.
+        method: The method that would find the gains.
+        folder: Folder to which the run would write its files.
+        keep: Whether the run would have the drives store the gains over a power cycle.
+        json: Print JSON instead of lines.
     """
     from tuning.rehearsal import Rehearsal, rehearse
 
@@ -53,7 +53,6 @@ def tell_plan(target: Target, method: OpenedMethod, folder: Path, *, keep: bool,
 
 
 def _lines(target: Target, method: OpenedMethod, found: Rehearsal, files: list[str]) -> list[str]:
-    """Return the plan for people."""
     where = "the drive is only read" if target.bus else "the drive is emulated, and nothing moves"
     lines = [f"dry run on {target.device.name}, {target.motor.name}, {target.machine}: {where}"]
     lines += [f"  {check.verdict:<4}  {check.what}: {check.found}" for check in found.checks]
@@ -90,7 +89,7 @@ def _finite(value: float) -> float | None:
 
 
 def _what_is_written(group: list[Any]) -> str:
-    """Return the line of objects that are written for the same purpose: objects, present values, new values."""
+    """Format the line of objects that are written for the same purpose: objects, present values, new values."""
     first = group[0]
     objects = ", ".join(f"{index:04X}h:{sub:02X}" for index, sub in (write.key for write in group))
     values = [value for write in group for value in write.present or ()]

@@ -1,4 +1,4 @@
-"""`drive-tune identify`: parameters of motor and machine from the drive's own signals, with intervals."""
+"""`drive-tune identify`: parameters of motor and machine, with intervals, from the drive's own signals."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def identify(
 
 
 def row(found: Identification) -> dict[str, Any]:
-    """Return an identification for JSON, with null for nan."""
+    """Convert an identification to JSON types, with null for nan."""
     from tuning.identify.wiring import named
 
     estimates = {

@@ -1,4 +1,4 @@
-"""How `drive-tune auto --by` finds gains: the methods, the options that each has, and what each does on the drives."""
+"""The methods of `drive-tune auto --by`: their options, and what each does with the drives."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 DESIGN, AGENT, RULE = "design", "agent", "rule"
 SEARCHES = ("tpe", "cmaes", "gp", "random", "grid")  # the samplers of tuning.search
 METHODS = (DESIGN, AGENT, *SEARCHES, RULE)
-RULE_BY_DEFAULT = "margin_55"  # it knows the resonance, and keeps standard dynamics by the model
-# Of `MethodOptions`: how each is typed where that is not its name, and the methods to which it means something.
+RULE_BY_DEFAULT = "margin_55"  # it includes the resonance in its margins, and keeps standard dynamics by the model
+# Options of `MethodOptions`: how each is typed if that is not its name; and its methods, by default the searches.
 TYPED = {"objectives": "--objective", "gains": "--gain"}
 HAVE = {"rule": (RULE,), "agent": (AGENT,), "trials": (AGENT, *SEARCHES)}  # the others are of the searches
 
@@ -35,7 +35,7 @@ By = Annotated[
 
 
 def _from_file(context: typer.Context, path: Path | None) -> Path | None:
-    """Take the defaults of all other options from settings.toml of a search."""
+    """Use settings.toml of a search as defaults of all other options."""
     if path is not None:
         with errors_as_exit_codes():
             from tuning.search.trials_files import load_options
@@ -46,7 +46,7 @@ def _from_file(context: typer.Context, path: Path | None) -> Path | None:
 
 @dataclass(frozen=True, kw_only=True)
 class MethodOptions:
-    """The options that only some methods have; one that is not given has its default here."""
+    """The options that only some methods have, with their defaults."""
 
     PANEL: ClassVar[str] = "How gains are found"
     rule: Annotated[
@@ -125,7 +125,7 @@ class MethodOptions:
     ] = None
 
     def check(self, by: str) -> None:
-        """Raise ValueError for a method that does not exist, or an option that the method does not have."""
+        """Raise ValueError for an unknown method, or an option that the method does not have."""
         if by not in METHODS:
             raise ValueError(f"no method is named {by!r}; there are {', '.join(METHODS)}")
         for f in fields(self):
@@ -138,11 +138,11 @@ class MethodOptions:
 
 
 class OpenedMethod(NamedTuple):
-    """A method that is known to suit the device.
+    """A method that fits the device.
 
     plan: What it does with the drives, for a dry run.
-    budget: Longest drive time for each axis [s]; infinite where the number of trials says how long it takes.
-    method: Return how a run finds gains on drives.
+    budget: Greatest drive time for each axis [s]; infinite if the number of trials limits it.
+    method: Returns, for opened drives, how a run finds gains.
     """
 
     plan: str
@@ -153,18 +153,18 @@ class OpenedMethod(NamedTuple):
 def open_method(
     by: str, options: MethodOptions, device: str, dynamics: str | None, load: str | None, tell: Callable[[str], None]
 ) -> OpenedMethod:
-    """Return the method of `--by` that is no search; no drive is opened yet.
+    """Return the method of `--by`, except a search; no drive is opened yet.
 
     Args:
         by: One of `METHODS`.
-        options: Its own.
-        device: Name of the device, or its path.
-        dynamics: What the loops must keep, as the user named it.
+        options: The options of methods.
+        device: Name or path of the device.
+        dynamics: Dynamics as the user gave them; None for standard ones.
         load: Name of an emulated machine's load; None on a bus.
-        tell: Called with a line for the user, as it goes on.
+        tell: Called with each progress line for the user.
 
     Raises:
-        ValueError: For a rule or an agent that does not exist, or a device that the method cannot tune.
+        ValueError: For an unknown rule or agent, or a device that the method cannot tune.
     """
     from drive_env.devices import find_device
     from drive_env.devices.gains import check_linear_model

@@ -1,4 +1,4 @@
-"""Options, target, progress and exit codes that the commands of `drive-tune` share."""
+"""Options, target, progress and exit codes shared by the commands of `drive-tune`."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ if TYPE_CHECKING:
     from tuning.snapshot import Transaction
     from tuning.target import Target
 
-# Whatever takes long to import (the compiler, MuJoCo, matplotlib) is imported by the command that needs it.
+# Packages that take long to import (the compiler, MuJoCo, matplotlib) are imported by the commands that need them.
 
-APART = "apart"  # of `tuning.target.AXES`
+APART = "apart"  # one of `tuning.target.AXES`
 MotorName = Annotated[
     str | None,
     typer.Option(
@@ -52,7 +52,7 @@ MotorName = Annotated[
 LoadName = Annotated[
     str, typer.Option("--load", help="Load of an emulated machine: a name, or the path of an MJCF file.")
 ]
-ForeignEds = Annotated[Path | None, typer.Option("--eds", hidden=True)]  # as drive-env has it; refused with the remedy
+ForeignEds = Annotated[Path | None, typer.Option("--eds", hidden=True)]  # of drive-env; refused here, with a remedy
 DYNAMICS = (
     "What the outer loops must keep: soft (60 degrees, 12 dB, Ms 1.5), standard (45, 8, 2.0), stiff (35, 6, 2.5), or "
     "phase margin/gain margin/Ms as 50/10/1.8."
@@ -133,7 +133,7 @@ Resume = Annotated[bool, typer.Option("--resume", help="Continue a stopped run w
 
 @dataclass(frozen=True, kw_only=True)
 class DriveOptions:
-    """The options that name a drive, emulated or on a bus; `takes` gives them to a command."""
+    """The options that name a drive, emulated or on a bus; `takes` adds them to a command."""
 
     PANEL: ClassVar[str] = "Which drive"
     bus: Bus = False
@@ -155,16 +155,16 @@ class DriveOptions:
 
     @property
     def motor_name(self) -> str:
-        """The motor: the device's usual one, if none was named."""
+        """Name of the motor; the device's usual one by default."""
         from drive_env.devices import find_device
 
         return find_device(self.device).default_motor if self.motor is None else self.motor
 
     def with_inputs(self) -> Self:
-        """Return the options with the content of the user's files in place of their paths.
+        """Return the options with the content of the user's files instead of their paths.
 
         Raises:
-            ValueError: If one cannot be read, as `inputs.taken` says it.
+            ValueError: If a file cannot be read, as in `inputs.taken`.
         """
         from tuning.runs.inputs import taken_options
 
@@ -172,13 +172,13 @@ class DriveOptions:
         return replace(self, **taken_options(names if self.bus else names | {"load": self.load}))
 
     def inputs(self) -> list[Input]:
-        """Return the user's files that the options have taken."""
+        """Return the user's files that `with_inputs` has read."""
         from tuning.runs.inputs import inputs_in
 
         return inputs_in([self.device, self.motor, self.load])
 
     def check(self) -> None:
-        """Raise ValueError for a number that cannot be, or a drive of which too little is known."""
+        """Raise ValueError for an impossible number, or a drive with too little data."""
         check_seed(self.seed)
         if self.eds is None and self.axis and self.bus:
             from drive_env.devices import find_device
@@ -193,14 +193,14 @@ class DriveOptions:
             )
 
     def check_linear_model(self) -> None:
-        """Raise ValueError for a drive whose loops are not those of the linear model, before anybody is asked."""
+        """Raise ValueError for a drive without a linear model of its loops; called before the user is asked."""
         from drive_env.devices import find_device
         from drive_env.devices.gains import check_linear_model
 
         check_linear_model(find_device(self.device))
 
     def machine(self) -> dict[str, Any]:
-        """Return the arguments of `tuning.target.emulated` in these options; raises as `open_target` does."""
+        """Return the options as arguments of `tuning.target.emulated`; raises as `open_target`."""
         self.check()
         check_no_bus(self.nodes, self.bitrate, self.lockstep, self.axes)
         named = {name: getattr(self, name) for name in ("device", "load", "seed", "supply")}
@@ -208,14 +208,14 @@ class DriveOptions:
         return named | ({"chosen": list(self.axis)} if self.axis else {})
 
     def open(self) -> Target:
-        """Return the drives, once the user lets a motor of a bus turn; raises as `open_target` does."""
-        self.check()  # before anybody is asked
+        """Open the drives, after the user has agreed that a motor on a bus turns; raises as `open_target`."""
+        self.check()  # before the user is asked
         if self.bus and self.travel is not None:
             ask_to_turn(self.nodes, self.yes, self.interface, self.axis)
         return open_target(self)
 
     def open_to_read(self) -> Target:
-        """Return the drives for a dry run, without asking; raises as `open_target` does, and for a silent node."""
+        """Open the drives for a dry run, without asking; raises as `open_target`, and if a node does not answer."""
         self.check()
         if self.bus:
             look_first(self.interface, self.channel, self.nodes, self.bitrate, self.device)
@@ -224,30 +224,30 @@ class DriveOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class TargetOptions(DriveOptions):
-    """The same, and how many emulated machines."""
+    """`DriveOptions`, and the number of emulated machines."""
 
     machines: Machines = None
     randomise: Randomise = False
 
     @property
     def count(self) -> int:
-        """How many emulated machines there are, 1 unless told otherwise."""
+        """Number of emulated machines, 1 by default."""
         return 1 if self.machines is None else self.machines
 
     def check(self) -> None:
-        """Raise ValueError for a number that cannot be."""
+        """Raise ValueError for an impossible number or an insufficiently described drive."""
         super().check()
         check_machines("--machines", self.count)
 
     def machine(self) -> dict[str, Any]:
-        """Return the arguments of `tuning.target.emulated` in these options; raises as `open_target` does."""
+        """Return the options as arguments of `tuning.target.emulated`; raises as `open_target`."""
         return super().machine() | {"num_machines": self.count, "randomise": self.randomise}
 
 
 def takes(command: Callable[..., None]) -> Callable[..., None]:
-    """Let a command have the fields of its dataclasses as options, its own and those of its argument `drive`.
+    """Add to a command the fields of its dataclasses as options, its own and those of its argument `drive`.
 
-    An option of a bus means drives on the bus.
+    An option of a bus selects drives on the bus.
     """
     run = grouped(command)
     shared = {p.name for p in options_of(inspect.signature(command, eval_str=True).parameters["drive"].annotation)}
@@ -265,10 +265,10 @@ def takes(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def parse_travel(text: str) -> tuple[float, float]:
-    """Return how far a rotor may turn [rad] from LOW:HIGH in turns, or `free`.
+    """Convert LOW:HIGH in turns, or `free`, to angles [rad].
 
     Raises:
-        ValueError: For anything else.
+        ValueError: For any other text.
     """
     if text == "free":
         return -math.inf, math.inf
@@ -285,10 +285,10 @@ def parse_travel(text: str) -> tuple[float, float]:
 
 
 def parse_travels(text: str) -> tuple[float, float] | list[tuple[float, float]]:
-    """Return how far the rotors may turn [rad]: one range for all of them, or one for each, with commas between.
+    """Convert travel to angles [rad]: one range for all rotors, or one for each, separated by commas.
 
     Raises:
-        ValueError: For anything else.
+        ValueError: For any other text.
     """
     ways = [parse_travel(part.strip()) for part in text.split(",")]
     return ways[0] if len(ways) == 1 else ways
@@ -311,9 +311,10 @@ def check_machines(option: str, machines: int) -> None:
 
 
 def check_no_bus(nodes: list[int] | None, bitrate: int | None, lockstep: bool, axes: str = APART) -> None:
-    """Raise ValueError for options of a bus where --bus was not said.
+    """Raise ValueError for options of a bus without --bus.
 
-    Interface and channel may be set by the environment: alone they do not mean the bus, lest a motor turn unexpectedly.
+    Interface and channel may come from the environment: alone they do not select the bus, so that no motor turns
+    unexpectedly.
     """
     if nodes or bitrate is not None or lockstep:
         raise ValueError("--node, --bitrate and --lockstep are for drives on a bus; add --bus, or leave them out")
@@ -326,7 +327,7 @@ def check_no_bus(nodes: list[int] | None, bitrate: int | None, lockstep: bool, a
 def ask_to_turn(
     nodes: list[int] | None, yes: bool, interface: str | None = None, axes: list[int] | None = None
 ) -> None:
-    """Continue if the user agrees that the motors on a bus turn; raises as `ask` does."""
+    """Continue if the user agrees that the motors on a bus turn; raises as `ask`."""
     from drive_env.master.open_drives import default_nodes
 
     which = f"node {', '.join(map(str, nodes or default_nodes(interface)))}"
@@ -336,17 +337,17 @@ def ask_to_turn(
 
 
 def open_target(drive: DriveOptions) -> Target:
-    """Open the drives of a command's options, on a bus or emulated ones, without asking.
+    """Open the drives of a command's options, on a bus or emulated, without asking.
 
     Raises:
-        ValueError: For a name that does not exist, or a bus without a travel; BusError if a node does not answer, or
-            another master commands it.
+        ValueError: For an unknown name, or a bus without a travel.
+        BusError: If a node does not answer, or another master commands it.
     """
     from drive_env.commands.scope import refuse_other_masters
     from tuning.target import LOCKSTEP_PATIENCE, emulated, on_bus
 
     drive.check()
-    inputs = tuple(drive.with_inputs().inputs())  # opened as given: the state before names the device for `undo`
+    inputs = tuple(drive.with_inputs().inputs())  # opened by path: the state before names the device for `undo`
     if not drive.bus:
         return replace(emulated(**drive.machine()), inputs=inputs)
     if drive.travel is None:
@@ -354,7 +355,8 @@ def open_target(drive: DriveOptions) -> Target:
     options: dict[str, Any] = {} if drive.bitrate is None else {"bitrate": drive.bitrate}
     if drive.lockstep:
         options |= {"pace": "lockstep", "timeout": LOCKSTEP_PATIENCE}
-    # Two tuners take each other's answers, and the second would keep the first one's trial as the state before.
+    # Two tuners would receive each other's answers, and the second would save the first one's trial as the state
+    # before.
     refuse_other_masters(drive.interface, drive.channel, drive.nodes, drive.bitrate)
     target = on_bus(
         drive.device,
@@ -375,8 +377,7 @@ def asked_dynamics(dynamics: str | None, device: str, inertia_range: str | None 
     """Return the dynamics that options ask for, standard ones by default.
 
     Raises:
-        ValueError: For dynamics that do not exist, or any that are asked of a drive without a linear model, as of a
-            stepper.
+        ValueError: For unknown dynamics, or any dynamics for a drive without a linear model, such as a stepper's.
     """
     from drive_env.devices import find_device
     from drive_env.devices.gains import has_linear_model
@@ -392,7 +393,7 @@ def asked_dynamics(dynamics: str | None, device: str, inertia_range: str | None 
 
 
 def file_of(drive: DriveOptions, kind: str, out: Path | None = None) -> Path | None:
-    """Return the file for the state before of drives on a bus, None for emulated ones; raises as `file_before` does."""
+    """Return the file for the state before of drives on a bus, None for emulated ones; raises as `file_before`."""
     if not drive.bus:
         return None
     from tuning.snapshot import file_before
@@ -402,7 +403,7 @@ def file_of(drive: DriveOptions, kind: str, out: Path | None = None) -> Path | N
 
 @contextmanager
 def unchanged(drive: DriveOptions, file: Path | None) -> Iterator[tuple[Target, Transaction | None]]:
-    """Open drives, with their state before in a file if one is given; restore at the end all but committed changes."""
+    """Open drives and save their state before to a file, if one is given; restore uncommitted changes at the end."""
     from tuning.snapshot import Transaction
     from tuning.way_back import way_back
 
@@ -415,12 +416,12 @@ def unchanged(drive: DriveOptions, file: Path | None) -> Iterator[tuple[Target, 
 
 
 def before_as_json(file: Path | None) -> dict[str, str]:
-    """Return the JSON entry of the file with the state before."""
+    """Return the JSON entry for the file with the state before; empty without one."""
     return {} if file is None else {"before": str(file)}
 
 
 def tell_before(file: Path | None) -> None:
-    """Print the differences of a bus' drives from their state before, and the line that restores it."""
+    """Print the differences of a bus' drives from their state before, and the command that restores it."""
     if file is not None:
         from tuning.way_back import what_is_changed
 
@@ -440,7 +441,7 @@ def errors_as_exit_codes() -> Iterator[None]:
 
 @contextmanager
 def progress_bar(description: str) -> Iterator[Callable[[float], None]]:
-    """Show a progress bar on stderr; the function given takes the share done, 0 to 1."""
+    """Show a progress bar on stderr; the yielded function takes the share that is done, 0 to 1."""
     from rich.console import Console
 
     with progress_on(Console(stderr=True), transient=True) as progress:
@@ -457,7 +458,7 @@ def fail(error: object, code: int = USER_ERROR) -> NoReturn:
 
 
 def what_an_interrupt_leaves(folder: Path) -> str:
-    """Return the message of an interrupted run that can be resumed."""
+    """Return the message of an interrupted run, with the command that resumes it if one can."""
     from tuning.runs import unfinished
 
     if unfinished.unfinished_folder(folder).exists():

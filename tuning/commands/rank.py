@@ -114,7 +114,7 @@ def rank(
 def _find_tuners(
     names: list[str] | None, trials: int | None, dynamics: str, slow: bool
 ) -> tuple[dict[str, Tuner], list[str]]:
-    """Return the tuners that are compared, and which were left out since a package of theirs is not installed."""
+    """Return the tuners to compare, and messages on those that were left out because a package is not installed."""
     from tuning.compare.tuners import MissingTunerError, find_tuner, tuner_rows
 
     tuners, left_out = {}, []
@@ -122,7 +122,7 @@ def _find_tuners(
         try:
             tuners[name] = find_tuner(name, trials, dynamics)
         except MissingTunerError as error:
-            if names:  # asked for by name
+            if names:  # the user asked for it by name
                 raise
             left_out.append(str(error))
     return tuners, left_out
@@ -148,7 +148,7 @@ def _compare(
     from tuning.runs.inputs import inputs_in
     from tuning.runs.pools import open_pool
 
-    # The machines themselves, too: they are what is tuned.
+    # The content of the machines is part of the settings, since the suite's file may change.
     run_text = settings_text({**settings, "machines": hashlib.sha256(repr(machines).encode()).hexdigest()})
     with unfinished.shard_log(folder, run_text, resume=resume, inputs=inputs_in(settings)) as log:
         if log.done:
@@ -200,7 +200,7 @@ def _print(comparison: Comparison, dynamics: str, folder: Path, left_out: list[s
 
 
 def _print_figures(comparison: Comparison, dynamics: str) -> None:
-    """Print the table of tuners, and their costs machine by machine."""
+    """Print the table of tuners, and that of their costs by machine."""
     from tuning.compare.against_best import all_rivals
 
     machines = comparison.tuners[0].machines

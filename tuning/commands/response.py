@@ -30,7 +30,7 @@ from tuning.identify.identified_axis import TITLES
 if TYPE_CHECKING:
     from tuning.response.measured_loop import MeasuredLoop
 
-FEWEST = 0.1  # of an axis's frequencies must be coherent for its response to say anything
+FEWEST = 0.1  # of an axis' frequencies that must be coherent; else the command fails
 COLUMNS = (
     "frequency [Hz]", "gain [dB]", "phase [deg]", "coherence", "trusted", "source",
 )  # fmt: skip
@@ -85,7 +85,7 @@ def response(
             tell_before(file)
         if measured.trusted.mean(axis=0).min() < FEWEST:
             worst = int(measured.trusted.mean(axis=0).argmin())
-            # Measured margins come before possible ones.
+            # Print the measured margins before the notes.
             why = "; ".join(measured.notes[worst]) or "the excitation was too weak"
             fail(f"less than a tenth of an axis's frequencies are coherent: {why}", REFUSED)
 

@@ -1,4 +1,4 @@
-"""`drive-tune rules`: gains that tuning rules propose for an axis, with the margins they would have."""
+"""`drive-tune rules`: shows the gains that tuning rules propose for an axis, with the margins they would have."""
 
 from __future__ import annotations
 
@@ -154,7 +154,7 @@ def _figure(value: float) -> str:
 
 
 def _gain_titles(known: GainSet) -> list[str]:
-    """Return a column's title for each gain: its object, where it is another than that of the gain before, and part."""
+    """Return a column's title for each gain: its part, and its object if that differs from the gain before."""
     told, titles = None, []
     for gain in known.rows:
         place = gain.loop, gain.key[0]

@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from tuning.target import Target
 
 MOST_SEARCHES = 10_000
-COPIES, TRIALS = 8, 30  # unless told otherwise
-OUTER_LOOPS, MARGINS = ("velocity", "position"), ("phase_deg", "gain_db", "ms")  # of `Optimised.margins`
+COPIES, TRIALS = 8, 30  # defaults
+OUTER_LOOPS, MARGINS = ("velocity", "position"), ("phase_deg", "gain_db", "ms")  # axes of `Optimised.margins`
 
 
 @dataclass
@@ -42,13 +42,13 @@ class SearchRun:
     """A search of gains by trials, from its options to its files.
 
     Attributes:
-        given: The drives' options as typed: the state before names their device for a later undo.
+        given: The drives' options as typed: the state before names the device for a later undo.
         drive: The same, with the content of the user's files.
-        options: Those of the method.
-        settings: How gains are searched.
-        folder: Where its files go.
-        done: The result, None until there is one.
-        machine: What was searched, for settings.toml; complete once the drives of a bus are open.
+        options: Options of the method.
+        settings: Settings of the search.
+        folder: Folder for its files.
+        done: The result; None until the search is done.
+        machine: The searched machine for settings.toml; complete when the drives of a bus are open.
     """
 
     given: TargetOptions
@@ -61,13 +61,13 @@ class SearchRun:
 
     @property
     def found(self) -> Optimised:
-        """The result, once there is one."""
+        """The result; the search must be done."""
         assert self.done is not None, "it was searched on the bus, or on copies before"
         return self.done
 
     @property
     def is_certified(self) -> bool:
-        """Whether auto can verify the gains: by a linear model of the loops, which steppers do not have."""
+        """Whether auto can verify the gains: it needs a linear model of the loops, which steppers do not have."""
         return self.settings.dynamics is not None
 
     @property
@@ -76,12 +76,12 @@ class SearchRun:
         return COPIES if self.drive.machines is None else self.drive.machines
 
     def on_machine(self) -> None:
-        """Search on an emulated machine, all searches as one."""
+        """Run all searches on an emulated machine, and join their results."""
         self.done = self._search_machine()
 
     @contextmanager
     def telling_what_is_lost(self) -> Iterator[None]:
-        """Have Ctrl-C say whether the trials are kept."""
+        """On Ctrl-C, exit with a message on whether the trials are kept."""
         try:
             yield
         except KeyboardInterrupt:
@@ -90,7 +90,7 @@ class SearchRun:
             fail(told if self.settings.journal is None else _kept_in(self.settings.journal), INTERRUPTED)
 
     def on_bus(self, target: Target, folder: Path, show: Any) -> None:
-        """Search on the drives of a bus, which have the best gains afterwards; write the files."""
+        """Search on the drives of a bus, leave the best gains in them, and write the files."""
         from tuning.search.optimise import optimise
 
         bus = {"nodes": self.drive.nodes or [1], "bitrate": self.drive.bitrate, "lockstep": self.drive.lockstep}
@@ -99,7 +99,7 @@ class SearchRun:
         try:
             self.done = optimise(target, self.settings, progress=show)
         except OSError as error:
-            if error.errno is None or journal is None:  # a drive's, or a file of which it says the name
+            if error.errno is None or journal is None:  # an error of a drive, or one that names its file
                 raise
             raise OSError(error.errno, error.strerror, str(journal)) from error
         self.save(folder)
@@ -129,10 +129,10 @@ class SearchRun:
         self.report(before, json=json)
 
     def method(self, folder: Path) -> Method:
-        """Return how a run of auto searches gains: on the drives of a bus themselves, else it was done on copies.
+        """Return the method for a run of auto: search on the drives of a bus, or use the emulated machine's result.
 
         Args:
-            folder: Where the files of the search go.
+            folder: Folder for the files of the search.
         """
         from tuning.auto.one_button import Method
 
@@ -167,7 +167,7 @@ class SearchRun:
         return try_gains(bench, basis, gains, np.full(target.num_axes, np.nan))
 
     def _answer(self, lanes: int) -> tuple[Any, list[float], list[str]]:
-        """Return gains, cost and note of every axis; of several searches of an emulated machine those of the best."""
+        """Return gains, cost and note of every axis; of several searches on an emulated machine those of the best."""
         found = self.found
         machines = range(len(found.gains) // lanes)
         if not self.drive.bus:
@@ -179,12 +179,12 @@ class SearchRun:
 
     @property
     def plan(self) -> str:
-        """What is done, in a few words."""
+        """Description of the search in a few words."""
         count = self.options.searches
         return f"{self.settings.trials} trials by {self.settings.sampler}" + (f", {count} times" if count > 1 else "")
 
     def save(self, folder: Path) -> None:
-        """Write trials.csv, trials.png and settings.toml into a folder that exists."""
+        """Write trials.csv, trials.png and settings.toml into an existing folder."""
         from tuning.runs import provenance
         from tuning.search.trials_files import save
 
@@ -206,7 +206,7 @@ class SearchRun:
         }  # fmt: skip
 
     def report(self, before: Path | None, *, json: bool) -> None:
-        """Print the result of a search without a certificate; arguments as `as_dict` has them."""
+        """Print the result of a search without certificate; arguments as in `as_dict`."""
         if json:
             print_json(self.as_dict(before))
             return
@@ -217,14 +217,14 @@ class SearchRun:
         print_lines(written)
 
     def print(self, before: Path | None) -> None:
-        """Print what was found; arguments as `as_dict` has them."""
+        """Print the result; arguments as in `as_dict`."""
         from tuning.runs.inputs import as_kept
 
         where = "the bus" if self.drive.bus else f"an emulated {as_kept(self.drive.load)}"
         _print(self.found, self.settings, before, where, self.machine)
 
     def _search_machine(self) -> Optimised:
-        """Return all searches on an emulated machine as one."""
+        """Run all searches on an emulated machine, and return their joined result."""
         from tuning.runs import provenance, unfinished
         from tuning.runs.inputs import inputs_in, table_of
         from tuning.runs.pools import open_pool
@@ -261,10 +261,10 @@ def open_search(
     inertia_range: str | None,
     out: Path | None,
 ) -> SearchRun:
-    """Return a search, from options that can be; no drive is opened yet.
+    """Create a search from valid options; no drive is opened yet.
 
     Raises:
-        ValueError: For options that cannot be.
+        ValueError: For invalid options.
     """
     from drive_env.devices import find_device
     from drive_env.devices.gains import has_linear_model
@@ -281,7 +281,7 @@ def open_search(
     provenance.check_folder(folder)
     device = find_device(drive.device)
     searched = tuple(options.gains) if options.gains else device.gains.outer
-    check_tried(device, searched)  # before anything moves
+    check_tried(device, searched)  # checked before anything moves
     asked = asked_dynamics(dynamics, drive.device, inertia_range)
     settings = Settings(
         sampler=by,
@@ -304,7 +304,7 @@ def open_search(
 
 
 def _check(drive: TargetOptions, options: MethodOptions, out: Path | None) -> None:
-    """Raise ValueError for options that cannot be together."""
+    """Raise ValueError for options that exclude each other or are out of range."""
     check_seed(drive.seed)
     if drive.machines is not None:
         check_machines("--machines", drive.machines)
@@ -325,7 +325,7 @@ def _check(drive: TargetOptions, options: MethodOptions, out: Path | None) -> No
 
 @contextmanager
 def left_to_trials(drives: Drives) -> Iterator[None]:
-    """Leave it to trials to stop an axis that oscillates, and give the sampler time to compute, during a search."""
+    """In a block, let trials stop an oscillating axis instead of the envelope, and give the sampler time to compute."""
     from tuning.search.trial_bench import leave_oscillations_to_trials
 
     limits = None if drives.safety is None else drives.safety.limits
@@ -338,7 +338,7 @@ def left_to_trials(drives: Drives) -> Iterator[None]:
 
 
 def _subject(drive: TargetOptions) -> str:
-    """Return the subject of a journal: the drive, and a machine's load, with hashes of the user's files."""
+    """Return the subject of a journal: drive and load, with hashes of the user's files."""
     from tuning.runs.inputs import as_kept, table_of
 
     named = _named(drive) | ({} if drive.bus else {"load": drive.load})
@@ -346,13 +346,13 @@ def _subject(drive: TargetOptions) -> str:
 
 
 def _named(drive: TargetOptions) -> dict[str, Any]:
-    """Return the entries of settings.toml that any drive has."""
+    """Return the entries of settings.toml that apply to every drive."""
     named = {"device": drive.device, "motor": drive.motor_name, "supply": drive.supply, "travel": drive.travel}
     return named | ({"axis": sorted(set(drive.axis))} if drive.axis else {})
 
 
 def _check_unfinished(folder: Path, journal: Path | None) -> None:
-    """Raise ValueError where there is no search to continue. A journal has its own check."""
+    """Raise ValueError if there is no search to continue. A journal is checked separately."""
     from tuning.runs import unfinished
 
     if (folder / "trials.csv").is_file():
@@ -429,7 +429,7 @@ def _print(found: Any, settings: Any, before: Path | None, where: str, options: 
 
 
 def _margins_by_model(found: Any, axes: Sequence[str]) -> list[str]:
-    """Return the margins of the outer loops with the best gains, for people; `axes` are the axes' names."""
+    """Format the outer loops' margins by the model with the best gains; `axes` are the axes' names."""
     lines = []
     for where, axis in zip(axes, found.margins.tolist(), strict=True):
         told = [
@@ -441,7 +441,7 @@ def _margins_by_model(found: Any, axes: Sequence[str]) -> list[str]:
 
 
 def _as_dicts(axis: list[list[float]]) -> dict[str, dict[str, float | None]]:
-    """Return the margins of an axis by the model, for JSON."""
+    """Convert the margins of an axis by the model to JSON types."""
     return {
         loop: {name: value if math.isfinite(value) else None for name, value in zip(MARGINS, values, strict=True)}
         for loop, values in zip(OUTER_LOOPS, axis, strict=True)
@@ -449,7 +449,7 @@ def _as_dicts(axis: list[list[float]]) -> dict[str, dict[str, float | None]]:
 
 
 def _what_counts(device: str, gains: tuple[str, ...] | None) -> list[str]:
-    """Return the terms of J that a stepper has in place of a servo's, for people; [] for a servo."""
+    """Explain the terms of J that differ for a stepper; empty for a servo."""
     from drive_env.devices import find_device
     from drive_env.trials.open_loop import unmeasured
     from tuning.search.trials_files import is_tried_by_pid, is_tried_open
@@ -476,7 +476,7 @@ def _what_counts(device: str, gains: tuple[str, ...] | None) -> list[str]:
 
 
 def _on_two_lines(title: str) -> str:
-    """Return a title with its unit, or its second half, below."""
+    """Break a title before its unit, or before "over"."""
     return title.replace(" [", "\n[").replace(" over ", "\nover ")
 
 
@@ -487,7 +487,7 @@ def _told(row: Any, objectives: Sequence[str], t_0: float) -> list[str]:
 
 
 def _cells(name: str, numbers: Sequence[int], gains: Any, told: list[str]) -> list[tuple[str, ...]]:
-    """Return the rows of a machine's gains, one for each of its axes; its figures stand in the first."""
+    """Return the table rows of a machine's gains, one per axis; its results are in the first."""
     first = name if list(numbers) == list(range(len(numbers))) else f"{name}, axis {numbers[0]}"
     return [
         (first if k == 0 else f"  axis {axis}", *map(str, row), *(told if k == 0 else [""] * len(told)))

@@ -143,13 +143,13 @@ def _run_with_progress(experiment: Any, console: Any, pool: Any, log: Any, folde
     said: set[str] = set()
 
     def say(message: Warning | str, *_: object, **__: object) -> None:
-        """Show a warning, of a machine that its motor cannot move, as a line and once."""
+        """Print each different warning once, such as one about a machine that its motor cannot move."""
         if str(message) not in said:
             said.add(str(message))
             _note(console, str(message))
 
     def stop(*_: object) -> None:
-        # Not by an exception: raised while the compiler calls back into Python it would be printed and lost.
+        # No exception: raised in a callback of the compiler into Python, it would be printed and lost.
         console.show_cursor(True)
         forget_copies()
         if not log.holds_results:
@@ -221,9 +221,9 @@ def _print_result(result: Any, folder: Path) -> None:
 def _print_best(result: Any, count: int) -> None:
     metric = result.experiment.metric.name
     figures = [name for name in TABLE_FIGURES if name in result.columns and not name.startswith(f"{metric} [")]
-    # Seven columns fit a terminal of 80 characters.
+    # Seven columns fit a terminal with 80 characters.
     shown = [*result.objects, result.score_column, *figures[: max(0, 6 - len(result.objects))]]
-    # Seconds are read as milliseconds.
+    # Seconds are printed as milliseconds.
     titles = [name.replace("score", metric).replace("[s]", "[ms]").replace(" [", "\n[") for name in shown]
     rows = []
     for row in result.best(count):
@@ -261,7 +261,7 @@ def _list_names() -> None:
     )
 
     devices = [find_device(name) for name in device_names()]
-    gains: dict[tuple[str, str], list[str]] = {}  # by object and what it is: devices that have it
+    gains: dict[tuple[str, str], list[str]] = {}  # object and description -> names of the devices that have it
     for device in devices:
         for e in gain_objects(device, device.new_dictionary()):
             gains.setdefault((f"{e.index:04X}h:{e.sub:02X}", f"{e.name}, {e.low}...{e.high}"), []).append(device.name)

@@ -88,7 +88,7 @@ def undo(
 def _planned(
     file: Path, snapshot: Snapshot, address: dict[str, Any], *, other_drive: bool
 ) -> list[tuple[int, Difference]]:
-    """Return the changes that a restoration would make, as (axis, difference); it raises where that would refuse."""
+    """Return the changes that a restoration would make, as (axis, difference); raises as the restoration would."""
     from drive_env.master.open_drives import open_drives
     from drive_env.master.parameters import check_at_rest
     from tuning import snapshot as snapshots
@@ -126,7 +126,7 @@ def _restore(
     from tuning import snapshot as snapshots
     from tuning.target import of_nodes
 
-    # Nothing turns: the envelope would only add its own limits.
+    # Nothing turns here; an envelope would only add its own limits.
     axes = address.pop("axes", None)
     with open_drives(snapshot.device, safety=False, **address) as drives:
         snapshots.check_same_drives(file, snapshot, drives, other_drive=other_drive)

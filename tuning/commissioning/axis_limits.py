@@ -1,4 +1,4 @@
-"""The limits that a commissioning sets: which objects have them, what is written, and whether they fit the motor."""
+"""The limits that a commissioning sets: their objects, writing them, and checking that they fit the motor."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from mechanics.arrays import Integers
     from tuning.target import Target
 
-PEAK = 3.0  # of the motor's rated current: a limit above is not this motor's
+PEAK = 3.0  # times the motor's rated current: a higher current limit is an error
 
 
 class LimitRow(NamedTuple):
-    """A limit: the objects or roles that have it, its meaning, and whether it counts from home."""
+    """A limit: its objects or roles, its meaning, and whether it is a position relative to home."""
 
     objects: tuple[Key | Role, ...]
     meaning: str
@@ -40,7 +40,7 @@ LIMITS = {
 
 
 def limits_of(target: Target) -> dict[str, list[Entry]]:
-    """Return the limits that a drive has, by name, with the objects that have each."""
+    """Return the limits that a drive has, by name, with the objects of each."""
     roles, dictionary = target.device.roles, target.device.new_dictionary()
     found = {}
     for name, row in LIMITS.items():
@@ -51,10 +51,10 @@ def limits_of(target: Target) -> dict[str, list[Entry]]:
 
 
 def raw_limits(target: Target, wanted: Mapping[str, str]) -> list[tuple[str, Entry, Integers]]:
-    """Return limits that are given as texts: name, object and the integers of all axes of each.
+    """Convert limits from texts: name, object, and raw integers of all axes.
 
     Raises:
-        ValueError: For a limit that the drive does not have, or a text of another quantity.
+        ValueError: For a limit that the drive does not have, or a text with another unit.
     """
     there = limits_of(target)
     if unknown := next((name for name in wanted if name not in there), None):
@@ -64,16 +64,15 @@ def raw_limits(target: Target, wanted: Mapping[str, str]) -> list[tuple[str, Ent
 
 
 def write_limits(target: Target, wanted: Mapping[str, str], *, places: bool) -> list[str]:
-    """Write limits that are given as texts, and return the values of each object, before and now, in words.
+    """Write limits given as texts; return a line per object with its old and new values.
 
     Args:
         target: The drives.
-        wanted: By name; those of the other kind are left out.
-        places: Whether those that count from home are meant.
+        wanted: Texts by name of the limit; those of the other kind are ignored.
+        places: True writes positions relative to home, False all other limits.
 
     Raises:
-        ValueError: For a limit that the drive does not have, or a text that does not fit it, before anything is
-            written.
+        ValueError: For a limit that the drive does not have, or an unsuitable text; nothing is written then.
     """
     drives = target.drives
     scales = quantities.scales_of(drives, target.device.new_dictionary())
@@ -93,10 +92,10 @@ def write_limits(target: Target, wanted: Mapping[str, str], *, places: bool) -> 
 
 
 def check_limits_of_motor(target: Target) -> list[str]:
-    """Return how limits protect the axes, in words.
+    """Check current limit and quick stop; return lines on how the limits protect the axes.
 
     Raises:
-        ValueError: For a current limit beyond the motor's, or a quick stop without a deceleration.
+        ValueError: For a current limit too high for the motor, or a quick stop without deceleration.
     """
     drives, motor, told = target.drives, target.motor, []
     if Role.CURRENT_LIMIT in target.device.roles:
@@ -118,7 +117,7 @@ def check_limits_of_motor(target: Target) -> list[str]:
 
 
 def check_place_of_axes(target: Target) -> None:
-    """Raise ValueError for an axis that stands outside of the drive's limits of position."""
+    """Raise ValueError if an axis is outside the drive's position limits."""
     low, high = (cia402.POSITION_LIMITS, 1), (cia402.POSITION_LIMITS, 2)
     if not target.device.new_dictionary().has(low):
         return

@@ -1,4 +1,4 @@
-"""What all steps of a commissioning work on: the drives, what the user wants, and how far the rotors have gone."""
+"""The data that all steps of a commissioning share: the drives, the user's plan, and how far the rotors have turned."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ if TYPE_CHECKING:
     from tuning.target import Target
 
 
-WHOLE = 2**32 - 1  # what 607Dh spans of a drive without limits of position
+WHOLE = 2**32 - 1  # span of 607Dh in a drive without position limits
 
 
 @dataclass
 class CommissioningPlan:
-    """What a user wants of a commissioning.
+    """What the user asks of a commissioning.
 
     Attributes:
-        dynamics: What the outer loops must keep.
-        method: Homing method; None leaves 6098h as it is, and homes by that.
-        limits: By the name of a limit, its value as text: "3 A".
-        store: Whether drives on a bus keep everything over a power cycle.
-        seed: Of the emulated machine, for the certificate.
+        dynamics: Requirements on the outer loops.
+        method: Homing method; None keeps the one in 6098h.
+        limits: Values as text by the name of the limit, e.g. "3 A".
+        store: Whether drives on a bus store all parameters over a power cycle.
+        seed: Seed of the emulated machine, for the certificate.
     """
 
     dynamics: str | Dynamics = DEFAULT
@@ -51,14 +51,14 @@ class CommissioningBench:
     """The drives of one commissioning.
 
     Args:
-        target: The drives; its travel counts from where the rotors stand now.
-        plan: What the user wants; it may change between steps.
-        folder: Where the files go.
+        target: The drives; its travel counts from the present angles of the rotors.
+        plan: The user's plan; it may change between steps.
+        folder: Folder for the files.
 
     Attributes:
-        result: Of the tuning, None before.
-        is_kept: Whether the parameters stay, which nothing takes back any more.
-        is_stored: Whether the drives keep them over a power cycle.
+        result: Result of the tuning; None before it.
+        is_kept: Whether the parameters stay for good: they are no longer rolled back.
+        is_stored: Whether the drives store them over a power cycle.
     """
 
     def __init__(self, target: Target, plan: CommissioningPlan, folder: Path) -> None:
@@ -69,7 +69,7 @@ class CommissioningBench:
         self._at_begin: Floats = np.zeros(target.num_axes)
 
     def here(self) -> Target:
-        """Return the target with the travel that is left from where the rotors are, also within the drive's limits."""
+        """Return the target with the travel that remains from here, also within the drive's position limits."""
         target, gone, here = self.target, self._gone(), self._position()
         low, high = target.low - gone, target.high - gone
         if target.device.new_dictionary().has((cia402.POSITION_LIMITS, 1)):
@@ -79,15 +79,15 @@ class CommissioningBench:
             low = np.where(is_limited, np.maximum(low, least), low)
             high = np.where(is_limited, np.minimum(high, most), high)
         low, high = np.minimum(low, 0.0), np.maximum(high, 0.0)
-        return replace(target, low=low, high=np.where(low < high, high, 1e-3))  # without any way: as good as none
+        return replace(target, low=low, high=np.where(low < high, high, 1e-3))  # without travel left: a tiny one
 
     def note_way(self, way: Floats) -> None:
-        """Note that since the step began the rotors have gone a way [rad], (num_axes,), and positions another zero."""
+        """Account for a way [rad] of the rotors in the step, shape (num_axes,), and a new zero of positions."""
         self._origin = self._position() - self._counts(self._at_begin + way)
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Have the envelope hold the axes to what is left of their travel while a block runs."""
+        """Limit the envelope to the remaining travel of the axes while a block runs."""
         envelope = self.target.drives.safety
         self._at_begin = self._gone()
         if envelope is None:
@@ -102,9 +102,9 @@ class CommissioningBench:
 
     @contextmanager
     def counting_anew(self) -> Iterator[None]:
-        """Let a block write what turns round, or scales, the positions of axes that are off.
+        """Let a block write objects that reverse or scale the positions of axes that are switched off.
 
-        The envelope, which refuses that under limits of position, has none meanwhile.
+        An envelope with position limits would refuse these writes, so it has none during the block.
         """
         drives, gone, scale = self.target.drives, self._gone(), self.target.increments()
         envelope = drives.safety
@@ -120,7 +120,7 @@ class CommissioningBench:
                 envelope.change(limits) if limits.position is None else hold_to_travel(self.here())
 
     def wire(self, values: Sequence[Mapping[Key, int]]) -> None:
-        """Write the settings of wiring, of every axis; travel and origin become those that are counted then."""
+        """Write the wiring settings of every axis, and convert travel and origin to the positions that they give."""
         self.target, self._origin = write_wiring(self.target, self._origin, values)
 
     def _gone(self) -> Floats:

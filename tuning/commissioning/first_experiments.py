@@ -1,4 +1,4 @@
-"""The first experiments of an identification alone: the check of the wiring, and at most the current pulses."""
+"""The first experiments of an identification alone: the wiring check, and optionally the current pulses."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from tuning.target import Target
 
 
 class FirstExperiments(Experiments):
-    """The first experiments, of all axes.
+    """The first experiments, with all axes.
 
     Args:
-        target, progress: As `identify` takes them.
-        pulses: Whether resistance and inductance are identified, too; otherwise no torque is commanded.
+        target, progress: As in `identify`.
+        pulses: Also identify resistance and inductance; otherwise no torque is commanded.
 
     Attributes:
-        good: Of which axes torque may be commanded, (num_axes,).
+        good: Axes whose wiring is correct, so that torque may be commanded, shape (num_axes,).
     """
 
     thorough = False
@@ -35,6 +35,6 @@ class FirstExperiments(Experiments):
         return self.good
 
     def turn(self, working: Working) -> None:
-        """Identify the windings, or nothing."""
+        """Identify the windings if pulses are wanted."""
         if self._pulses:
             self.pulse_currents(working)

@@ -1,4 +1,4 @@
-"""The step of a commissioning that finds home by a method of the drive, and brings the axis back to where it stood."""
+"""The step of a commissioning that homes the axes by a method of the drive, and moves each back to its old place."""
 
 from __future__ import annotations
 
@@ -29,20 +29,20 @@ if TYPE_CHECKING:
 
 HOMING_OBJECTS: tuple[Key, ...] = ((cia402.HOMING_METHOD, 0), SEARCH, EDGE, ACCELERATION)
 LONGEST = 60.0  # s
-FASTEST, NOISE = 4.0, 0.002  # a sample farther away than so many times the homing speed, and turns, has another zero
-MOVED = 0.01  # turns from where the axis stood, from which on it is brought back
-READY = 0.05  # s at rest before and after: samples are mapped before an axis is enabled
+FASTEST, NOISE = 4.0, 0.002  # times the homing speed, and turns: a larger change of a sample is a new zero
+MOVED = 0.01  # turns: a shorter way is not moved back
+READY = 0.05  # s at rest before and after homing: samples are mapped before an axis is enabled
 
 
 class WayWatch(Observer):
-    """Adds up how far rotors go while the zero of their positions changes.
+    """Adds up how far rotors turn while the zero of their positions changes.
 
     Args:
-        speeds: That are not exceeded [inc/s], (num_axes,).
-        noise: By which samples at rest may differ [inc], likewise.
+        speeds: Greatest possible speed of each axis [inc/s], shape (num_axes,).
+        noise: Greatest difference of samples at rest [inc], shape (num_axes,).
 
     Attributes:
-        way: So far [inc], likewise.
+        way: Sum so far [inc], shape (num_axes,).
     """
 
     objects = (cia402.POSITION_ACTUAL,)
@@ -54,7 +54,7 @@ class WayWatch(Observer):
         self._at = 0.0
 
     def passed(self, below: Drives, duration: float, trace: Trace, asked: Any, play: Any) -> None:
-        """Take what was sampled; on a bus in real time there may be a gap before it."""
+        """Add the changes of position except those of the zero; in real time, samples may be missing before it."""
         rows, now = np.asarray(trace[cia402.POSITION_ACTUAL], float), time.monotonic()
         spans = np.full((len(rows), 1), duration / len(rows))
         if self._last is not None:
@@ -67,42 +67,42 @@ class WayWatch(Observer):
 
 
 def unfit_for_homing(target: Target) -> str:
-    """Return why axes are not homed here; "" where they can be."""
+    """Return why axes cannot be homed here; "" if they can."""
     if not target.device.new_dictionary().has(cia402.HOMING_METHOD):
         return "the drive has no homing: it lacks 6098h"
     return "the axes pull at one thing: none is homed without the others" if target.linked else ""
 
 
 def check_method(target: Target, method: int | None) -> None:
-    """Raise ValueError for a homing method that the drives do not have; None is the drive's own."""
+    """Raise ValueError for a homing method that the drives do not have; None, the drive's own method, is accepted."""
     if method is not None and method not in (there := offered_methods(target)):
         raise ValueError(f"homing method {method}: the drive has {', '.join(map(str, there)) or 'none'}")
 
 
 def offered_methods(target: Target) -> dict[int, str]:
-    """Return the homing methods that the drives have, each with what it does."""
+    """Return the homing methods of the drives, each with its description."""
     known = _description(target)
     return {number: method_text(number, is_known=True) for number in methods_of(target.drives, known, 0)}
 
 
 def no_method(target: Target) -> str:
-    """Return that no method is chosen, and those that there are, in words."""
+    """Return the message that no method is chosen, with the methods that exist."""
     listed = "; ".join(f"{number}: {text}" for number, text in offered_methods(target).items())
     return f"no homing method is chosen (6098h is 0); those of the drive are {listed}"
 
 
 def has_no_method(bench: CommissioningBench) -> bool:
-    """Return whether homing needs the choice of a method first."""
+    """Return whether the user must choose a method before homing."""
     chosen = bench.plan.method is not None or bool(bench.target.drives.read(cia402.HOMING_METHOD).any())
     return not chosen and not any(LIMITS[name].is_place for name in bench.plan.limits)
 
 
 def home_axes(bench: CommissioningBench) -> list[str]:
-    """Home the axes one after the other, and bring each back to where it stood; return the results, in lines.
+    """Home the axes one after the other, and move each back to its old place; return lines with the results.
 
     Raises:
         ValueError: For a method that the drive does not have.
-        RuntimeError, TimeoutError: If no method is chosen, or an axis does not attain home.
+        RuntimeError, TimeoutError: If no method is chosen, or an axis does not reach home.
     """
     target, drives = bench.target, bench.target.drives
     own, wanted = drives.read(cia402.HOMING_METHOD), bench.plan.method
@@ -122,7 +122,7 @@ def home_axes(bench: CommissioningBench) -> list[str]:
 
 
 def _give_speeds(target: Target, axis: int, method: int) -> list[str]:
-    """Write the speeds and the acceleration that a method needs where they are 0, by the motor's rated ones."""
+    """Write speeds and acceleration of a method where they are 0, from the motor's rated values; return the lines."""
     drives, motor = target.drives, target.motor
     values = {
         SEARCH: HOMING_SPEED * motor.rated_speed,
@@ -138,7 +138,7 @@ def _give_speeds(target: Target, axis: int, method: int) -> list[str]:
 
 
 def _home(bench: CommissioningBench, axis: int, method: int) -> str:
-    """Home an axis, bring it back to where it stood, and switch it off."""
+    """Home an axis, move it back to its old place, and switch it off; return the line with the result."""
     target, where = bench.target, _only(bench.target, axis)
     turn = 2.0 * np.pi * target.increments()
     speeds = target.drives.read(SEARCH) / per_increment(target.drives, SEARCH)
@@ -146,7 +146,7 @@ def _home(bench: CommissioningBench, axis: int, method: int) -> str:
     drives = ObservedDrives(target.drives, watch)
     drives.advance(READY)
     motion.enable(drives, mode="hm", where=where)
-    _settle(target, drives, where)  # home is where it then stands
+    _settle(target, drives, where)  # methods that take the present position as home take this one
     motion.home(drives, where=where, timeout=LONGEST)
     _settle(target, drives, where)
     way, at = np.where(where, watch.way, 0.0), int(drives.read(cia402.POSITION_ACTUAL)[axis]) / turn[axis]
@@ -163,7 +163,7 @@ def _home(bench: CommissioningBench, axis: int, method: int) -> str:
 
 
 def _settle(target: Target, drives: Drives, where: Mask) -> None:
-    """Let an axis come to rest, and its encoder be aligned, which some drives do when they are enabled first."""
+    """Wait until an axis is at rest and its encoder aligned, which some drives do when they are first enabled."""
     drives.advance(READY)
     waited = 0.0
     while waited < ALIGNMENT_TIME and (np.any(where & is_aligning(target)) or motion.is_turning(drives, where, READY)):

@@ -1,7 +1,7 @@
-"""The path of a commissioning: steps in their order, the state of each, a way back, and the state before.
+"""The path of a commissioning: its steps in order, the state of each, going back, and the state before.
 
-The state before is in a file before the first step; an error of the bus, a stop, or the end of the path brings it back
-unless the parameters were stored. Of a step that fails, what it has written is taken back, and it can be done again.
+The state before is saved to a file before the first step. An error of the bus, a stop, or the end of the path restores
+it unless the parameters were stored. If a step fails, its writes are undone, and it can be repeated.
 """
 
 from __future__ import annotations
@@ -28,21 +28,21 @@ if TYPE_CHECKING:
     from tuning.target import Target
 
 PENDING, RUNNING, DONE, FAILED, SKIPPED = "pending", "running", "done", "failed", "skipped"
-LAST = "store"  # from here on nothing is taken back
-REST, PIECE = 3.0, 0.02  # s that axes get to come to rest, and between two looks
+LAST = "store"  # the step after which nothing is undone
+REST, PIECE = 3.0, 0.02  # s that axes get to come to rest, and between two checks of it
 BEFORE = "before.toml"
 
 
 @dataclass(frozen=True)
 class StepState:
-    """The state of a step, and what came of it: lines for people, or one line, why it failed or is left out."""
+    """The state of a step, and its result: lines for the user, or one line with the reason of a failure or a skip."""
 
     state: str = PENDING
     lines: tuple[str, ...] = ()
 
 
 def check_off(target: Target) -> None:
-    """Raise RuntimeError for an axis that is enabled: a commissioning begins with all of them off."""
+    """Raise RuntimeError if an axis is enabled: a commissioning begins with all axes switched off."""
     live = np.flatnonzero([cia402.is_live(int(word)) for word in target.drives.read(cia402.STATUSWORD)])
     if live.size:
         number = target.axis_numbers[int(live[0])]
@@ -50,15 +50,15 @@ def check_off(target: Target) -> None:
 
 
 class CommissioningPath:
-    """A commissioning; entering saves the state before, leaving brings it back unless the parameters were stored.
+    """A commissioning; entering saves the state before, leaving restores it unless the parameters were stored.
 
     Args:
-        target: The drives, none of them enabled; its travel counts from where the rotors stand now.
-        plan: What the user wants; it may change between steps.
-        folder: For the state before and the certificate: new or empty.
+        target: The drives, all of them switched off; its travel counts from the present angles of the rotors.
+        plan: The user's plan; it may change between steps.
+        folder: New or empty folder for the state before and the certificate.
 
     Attributes:
-        states: Of every step, by name.
+        states: State of every step, by name.
     """
 
     def __init__(self, target: Target, plan: CommissioningPlan, folder: Path) -> None:
@@ -79,7 +79,7 @@ class CommissioningPath:
 
     @property
     def is_kept(self) -> bool:
-        """Whether the parameters stay, which nothing takes back any more."""
+        """Whether the parameters stay for good: they are no longer rolled back."""
         return self.bench.is_kept
 
     @property
@@ -102,10 +102,10 @@ class CommissioningPath:
             self._transaction.__exit__(kind, error, traceback)
 
     def run(self, name: str, say: Say) -> StepState:
-        """Do a step; its state afterwards is done or failed.
+        """Run a step; afterwards its state is done or failed.
 
         Raises:
-            BusError: If the drives cannot be reached any more; the path must be ended then.
+            BusError: If the drives can no longer be reached; the path must be left then.
         """
         step, bench = STEPS[name], self.bench
         if self.states[name].state == DONE:
@@ -134,16 +134,16 @@ class CommissioningPath:
         return self.states[name]
 
     def skip(self, name: str, why: str = "left out") -> None:
-        """Leave a step out, and with tuning or storing the certificate, which is of both."""
+        """Skip a step; skipping tuning or storing also skips the certificate, which needs both."""
         self.states[name] = StepState(SKIPPED, (why,))
         if name in ("tune", LAST):
             self.states["certificate"] = StepState(SKIPPED, (f"{STEPS[name].title} was left out",))
 
     def back_to(self, name: str) -> None:
-        """Go back to a step: the drives have the parameters from before it, and it and those after it are to be done.
+        """Go back to a step: restore the parameters from before it, and mark it and all later steps as pending.
 
         Raises:
-            ValueError: Once the parameters are stored.
+            ValueError: If the parameters are already stored.
         """
         if self.is_kept:
             raise ValueError(f"the parameters are kept; drive-tune undo {self.file} restores the state before")
@@ -160,13 +160,13 @@ class CommissioningPath:
             self.bench.result = None
 
     def _return_to(self, earlier: Snapshot) -> None:
-        """Bring the axes to rest, switch them off, and write back what they had."""
+        """Bring the axes to rest, switch them off, and restore earlier parameters."""
         with undisturbed(), self._counting_as(earlier):
             self._transaction.roll_back(to=earlier)
 
     @contextmanager
     def _counting_as(self, earlier: Snapshot) -> Iterator[None]:
-        """Have the axes off, at rest, and counting as they did, while a block writes back what they had."""
+        """Bring axes to rest, switch them off and restore their counting, for a block that restores parameters."""
         bench = self.bench
         self._come_to_rest()
         with bench.counting_anew():
@@ -174,12 +174,12 @@ class CommissioningPath:
             bench.wire([{key: one[key] for key in keys if key in one} for one in earlier.axes] if keys else [])
             yield
         other = (self._modes != 0) & (bench.target.drives.read(cia402.MODE) != self._modes)
-        if other.any():  # 0, no mode, is what a drive has before its first; it cannot be written
+        if other.any():  # 0, no mode, is the value before the first mode; it cannot be written
             bench.target.drives.write(cia402.MODE, self._modes, where=other)
 
     def _come_to_rest(self) -> None:
         drives = self.bench.target.drives
-        with suppress(SafetyError):  # after a stop of the envelope its first call tells of it
+        with suppress(SafetyError):  # after a stop by the envelope the first call reports it
             drives.read(cia402.STATUSWORD)
         on = np.asarray(cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED))
         if on.any():

@@ -1,6 +1,6 @@
-"""The steps of a commissioning, in their order: what to look at, what is measured and written, and how it is done.
+"""The steps of a commissioning in order: what the user checks, what is measured and written, and the functions.
 
-A step raises what says in one line why it failed; what it has written is then taken back by the path.
+A step that fails raises an error with the reason in one line; the path then undoes its writes.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ if TYPE_CHECKING:
     from tuning.identify.identified_axis import Identification
     from tuning.stepper.result import StepperAxis, StepperResult
 
-Say = Callable[[str, float], None]  # what is under way, and the share of the step that is done, 0...1
+Say = Callable[[str, float], None]  # name of the present action, and the share of the step that is done, 0...1
 OPEN_LOOP = "the motor is driven in open loop: there is nothing of it to identify"
-# Of the data sheet's, what a winding may have: beyond, it is another motor.
+# Identified resistance and inductance as a share of the data sheet's: beyond these limits it is another motor.
 LEAST_SHARE, MOST_SHARE = 0.5, 2.0
-STIFF = "stiff"  # dynamics below which loops are not accepted
+STIFF = "stiff"  # the limit: loops below the margins of these dynamics are not accepted
 
 
 @dataclass(frozen=True)
@@ -54,14 +54,14 @@ class CommissioningStep:
     """A step.
 
     Attributes:
-        name: For options and files.
-        title: For people.
-        look: What to look at before it.
+        name: Name in options and files.
+        title: Name for users.
+        look: What the user should check before it.
         measured: What is measured.
-        writes: The objects that keep what it writes, of a target.
-        run: Does it; returns what came of it, in lines.
+        writes: Returns the objects of a target that the step writes for good.
+        run: Runs the step; returns its results as lines.
         moves: Whether the motor turns.
-        unfit: Why the target has no such step; "" where it has.
+        unfit: Returns why the target cannot do the step; "" if it can.
     """
 
     name: str
@@ -74,9 +74,9 @@ class CommissioningStep:
     unfit: Callable[[Target], str] = lambda target: ""
 
 
-# --- what the steps do ------------------------------------------------------------------------------------------------
+# --- functions of the steps -------------------------------------------------------------------------------------------
 def write_motor(bench: CommissioningBench, say: Say) -> list[str]:
-    """Write the data of motor and encoder, gains and profile that follow from them."""
+    """Write the data of motor and encoder, and gains and profile computed from them."""
     target, wanted = bench.target, motor_parameters(bench.target)
     wiring = {key: value for key, value in wanted.items() if key in findings(target.device)}
     before = {key: target.drives.read(key) for key in wanted}
@@ -116,7 +116,7 @@ def _checked_wiring(bench: CommissioningBench, say: Say) -> tuple[list[Identific
 
 
 def tune_current_loop(bench: CommissioningBench, say: Say) -> list[str]:
-    """Identify the winding, and set P and I of the current loop for it."""
+    """Identify the winding, and set P and I of the current loop accordingly."""
     target = bench.here()
     with swinging_allowed(target.drives):
         found = FirstExperiments(target, say, pulses=True).run()
@@ -149,13 +149,13 @@ def tune_current_loop(bench: CommissioningBench, say: Say) -> list[str]:
 
 
 def set_limits(bench: CommissioningBench, say: Say) -> list[str]:
-    """Write the limits that are given, less those that count from home, and check that they are the motor's."""
+    """Write the given limits, except positions relative to home, and check that they fit the motor."""
     lines = write_limits(bench.target, bench.plan.limits, places=False)
     return [*lines, *check_limits_of_motor(bench.target)]
 
 
 def find_home(bench: CommissioningBench, say: Say) -> list[str]:
-    """Home, and write the limits that count from home."""
+    """Home the axes, and write the limits that are positions relative to home."""
     lines = home_axes(bench)
     lines += write_limits(bench.target, bench.plan.limits, places=True)
     check_place_of_axes(bench.target)
@@ -163,7 +163,7 @@ def find_home(bench: CommissioningBench, say: Say) -> list[str]:
 
 
 def identify_axes(bench: CommissioningBench, say: Say) -> list[str]:
-    """Identify everything."""
+    """Identify all parameters of the axes."""
     lines = []
     with swinging_allowed(bench.target.drives):
         every = identify(bench.here(), progress=say)
@@ -177,13 +177,13 @@ def identify_axes(bench: CommissioningBench, say: Say) -> list[str]:
 
 
 def tune_axes(bench: CommissioningBench, say: Say) -> list[str]:
-    """Tune by auto, of an open-loop stepper by its commissioning; nothing is stored yet."""
+    """Tune by auto, or an open-loop stepper by its commissioning; nothing is stored yet."""
     from tuning.auto.one_button import auto
     from tuning.search.trial_bench import leave_oscillations_to_trials
     from tuning.stepper.commissioning import commission
 
     target, plan = bench.here(), bench.plan
-    with tempfile.TemporaryDirectory() as folder:  # the way back is the file of the whole path
+    with tempfile.TemporaryDirectory() as folder:  # discarded: the file of the whole path restores the drives
         before = Path(folder) / "before.toml"
         result: Result | StepperResult
         if has_linear_model(target.device):
@@ -202,7 +202,7 @@ def tune_axes(bench: CommissioningBench, say: Say) -> list[str]:
 
 
 def verify_loops(bench: CommissioningBench, say: Say) -> list[str]:
-    """Measure the velocity loop once more, with the gains that the drive has, and compare its margins."""
+    """Measure the velocity loop again with the gains in the drive, and compare its margins with the dynamics."""
     from tuning.response.frequency_response import measure
 
     target = bench.here()
@@ -226,7 +226,7 @@ def verify_loops(bench: CommissioningBench, say: Say) -> list[str]:
 
 
 def store_parameters(bench: CommissioningBench, say: Say) -> list[str]:
-    """Have the drives keep their parameters, where that was asked for and they can."""
+    """Have the drives store their parameters if the user wants it and they can."""
     if not bench.plan.store:
         return ["kept until the drives are switched off; they were not to store it"]
     if not can_store(bench.target):
@@ -238,7 +238,7 @@ def store_parameters(bench: CommissioningBench, say: Say) -> list[str]:
 
 
 def certify(bench: CommissioningBench, say: Say) -> list[str]:
-    """Write the certificate of the tuning, with what was stored."""
+    """Write the certificate of the tuning, with the information whether it was stored."""
     from tuning.auto.certify import certificate
     from tuning.auto.result import Result
     from tuning.certificate.certificate_files import certificate_files
@@ -266,7 +266,7 @@ def _value(estimate: Estimate) -> str:
 
 
 def _beside(title: str, estimate: Estimate, sheet: float) -> str:
-    """Return an estimate beside the data sheet's value; RuntimeError for one of another motor."""
+    """Format an estimate beside the data sheet's value; RuntimeError if they differ too much for the same motor."""
     if not estimate.is_known:
         return f"{title} not identified, so the data sheet's {sheet:.4g} {estimate.unit} counts: {estimate.reason}"
     told = f"{title} {_value(estimate)}; data sheet {sheet:.4g} {estimate.unit}"
@@ -286,7 +286,7 @@ def _figures(found: Margins) -> str:
 
 
 def _shortfall(found: Margins, asked: Dynamics) -> str:
-    """Return which margins, as far as they were measured, are less than asked for, beyond what a measurement is off."""
+    """List the measured margins that fall short of the dynamics by more than the measurement error, as text."""
     every = [one for one in asked_margins(asked) if one.missed(getattr(found, one.field), one.error)]
     return ", ".join(f"{one.name} {one.limit:g} {one.unit}".rstrip() for one in every)
 

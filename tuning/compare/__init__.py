@@ -1,1 +1,1 @@
-"""Tuners on the same machines."""
+"""Comparison of tuners on the same machines."""

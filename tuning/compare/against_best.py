@@ -1,7 +1,7 @@
-"""Tuners machine by machine: robust cost over that of the best other tuner on the same machine.
+"""Each tuner against the best other tuner of each machine: ratio of their robust costs.
 
-A median over machines hides which tuner wins where. Here a tuner is compared with the best of the others on each
-machine, chosen with knowledge of the outcome.
+A median over machines hides which tuner is best on which machine. Here a tuner is compared on each machine with the
+best of the others, which is chosen afterwards by the result.
 """
 
 from __future__ import annotations
@@ -21,9 +21,11 @@ if TYPE_CHECKING:
 class RivalRow:
     """A tuner against the best of the others on each machine.
 
-    rivals: Their names. machines: How many there are. median: Of the robust cost over that of the best rival, with
-    `low` and `high`, the ends of its 95 % bootstrap interval over machines. better: Machines on which it is below all
-    rivals.
+    rivals: Names of the others.
+    machines: Number of machines.
+    median: Median over machines of the robust cost over that of the best rival.
+    low, high: Ends of its 95 % bootstrap interval over machines.
+    better: Number of machines on which the tuner has a lower cost than all rivals.
     """
 
     tuner: str
@@ -36,7 +38,7 @@ class RivalRow:
 
 
 def all_rivals(comparison: Comparison) -> tuple[RivalRow, ...]:
-    """Return every tuner against the best of all others on each machine, the best first; nothing of one alone."""
+    """Compare every tuner with the best of all others on each machine, lowest median first; empty for one tuner."""
     costs = {one.tuner: np.array([row.robust_cost for row in comparison.of(one.tuner)]) for one in comparison.tuners}
     rows = []
     for name, own in costs.items():

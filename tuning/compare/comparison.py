@@ -1,8 +1,8 @@
-"""Tuners compared on the same machines: what their gains are worth, and the drive time and moves they took.
+"""Compares tuners on the same machines: the quality of their gains, and the drive time and moves that they need.
 
-Every tuner gets every machine as it comes from the box, under an audit that counts time, moves and violations. Gains
-are judged in the emulator (drive_env/trials/score.py): their robust performance over that of the machine's constrained
-oracle (oracle.py), whether they keep the constraints, and the true margins; a tuner never sees any of it.
+Every tuner gets every machine with factory settings, under an audit that counts time, moves and violations. Gains are
+judged in the emulator (drive_env/trials/score.py): robust performance over that of the machine's constrained oracle
+(oracle.py), whether the constraints are kept, and the true margins. No tuner can read any of these.
 """
 
 from __future__ import annotations
@@ -38,21 +38,28 @@ if TYPE_CHECKING:
 
 Progress = Callable[[str, float], None]
 
-NEAR_PHASE, NEAR_GAIN = 5.0, 1.0  # degrees and dB by which margins may be missed and still be near
+NEAR_PHASE, NEAR_GAIN = 5.0, 1.0  # degrees and dB below the demanded margins up to which they are near
 
 
 @dataclass(frozen=True)
 class MachineRow:
     """The result of a tuner on a machine.
 
-    robust_cost, performance: Of its gains, with and without constraints. oracle: The oracle's performance, relative:
-    over it. slack: How far the gains keep the constraints, below 0 where one is broken. phase_deg, gain_db, ms: True
-    margins of the worst outer loop; 0, 0 and 100 of an unstable machine. All four are None without a linear model.
-    near: Whether phase and gain margin are within 5 degrees and 1 dB of those demanded. accepted: Whether the tuner
-    vouches for them. drive_seconds: Until the drive was last written to or moved [s], waits for the machines beside it
-    included. moves: Of all its axes, each from standstill to standstill (moves.py). aborts: As the tuner says.
-    violations: Of all kinds. gains: Raw gains of the machine's first axis, by the names that its device has for them.
-    note: What the tuner says, or why it failed; then the gains are those that it left behind.
+    robust_cost, performance: Of the tuner's gains, with and without constraints.
+    oracle: Performance of the oracle.
+    relative: Performance over the oracle's.
+    slack: Relative distance of the gains to the nearest constraint, below 0 if one is broken; None without a linear
+        model, as the margins.
+    phase_deg, gain_db, ms: True margins of the worst outer loop; 0, 0 and 100 for an unstable machine.
+    near: Whether phase and gain margin are at most 5 degrees and 1 dB below those demanded.
+    accepted: Whether the tuner guarantees the gains.
+    drive_seconds: Time until the drive was last written to or moved [s], with waiting for the machines tuned together.
+    moves: Moves of all axes, each from standstill to standstill (move_counter.py).
+    aborts: As counted by the tuner.
+    violations: Violations of all kinds; `kinds` lists them as text.
+    failed: Whether the tuner raised an error; the gains are then those that it left in the drive.
+    gains: Raw gains of the machine's first axis, by the device's names.
+    note: Notes of the tuner, or its error.
     """
 
     tuner: str
@@ -86,12 +93,15 @@ class MachineRow:
 class TunerRow:
     """The result of a tuner over all machines.
 
-    median, p95: Of the robust performance over the oracle's. kept: Share of machines whose gains keep all constraints.
-    near: Share whose true phase and gain margins are within 5 degrees and 1 dB of those demanded. phase_deg, phase_p5,
-    gain_db, ms, ms_p95: Margins of a machine's worst outer loop, phase: median and 5th percentile, gain: median, Ms:
-    median and 95th percentile; None where no drive has a linear model. accepted: Share that the tuner vouches for.
-    drive_seconds, moves: Median of a machine. aborts, violations: Of all machines together. failed: Machines on which
-    it gave up with an error.
+    median, p95: Of the robust performance over the oracle's.
+    kept: Share of machines whose gains keep all constraints.
+    near: Share of machines whose true phase and gain margins are at most 5 degrees and 1 dB below those demanded.
+    phase_deg, phase_p5, gain_db, ms, ms_p95: Margins of a machine's worst outer loop: phase (median and 5th
+        percentile), gain (median), Ms (median and 95th percentile); None if no drive has a linear model.
+    accepted: Share of machines whose gains the tuner guarantees.
+    drive_seconds, moves: Medians over machines.
+    aborts, violations: Sums over all machines.
+    failed: Number of machines on which the tuner raised an error.
     """
 
     tuner: str
@@ -115,7 +125,7 @@ class TunerRow:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Rows of every tuner and machine, and what each tuner is worth: the first keeps most, then by median."""
+    """Rows of every tuner and machine, and a summary per tuner, sorted by kept constraints, then by median."""
 
     rows: tuple[MachineRow, ...]
     tuners: tuple[TunerRow, ...]
@@ -138,20 +148,20 @@ def compare(
     oracles: Mapping[str, Oracle] | None = None,
     dynamics: str = DEFAULT,
 ) -> Comparison:
-    """Have every tuner tune every machine.
+    """Tune every machine with every tuner.
 
     Args:
-        machines: The suite.
-        tuners: By name.
-        seed: What the tuners draw from; the same machines and tuner see the same chances whatever else is compared.
-        num_threads: As `EmulatedDrives` takes it.
-        log: What tuners made of machines already, and where what is to come is kept.
-        progress: Called with what is under way and the share that is done.
-        pool: Where else it runs, which changes no digit; there the tuners are found by their names, `trials` and
+        machines: The machines of the suite.
+        tuners: Tuners by name.
+        seed: Seed of the tuners; the same machines and tuner get the same random numbers, whatever else is compared.
+        num_threads: As in `EmulatedDrives`.
+        log: Log with the finished rows of an earlier run, to which new ones are added.
+        progress: Called with the present action and the share that is done.
+        pool: Processes that run the tasks, with identical results; they look tuners up by name, `trials` and
             `dynamics`.
-        trials: As `find_tuner` takes it.
-        oracles: Of the machines, by name; found by default.
-        dynamics: What the loops must keep, by which gains are judged.
+        trials: As in `find_tuner`.
+        oracles: Oracles of the machines by name; searched by default.
+        dynamics: Requirements on the loops by which gains are judged.
     """
     best = find_oracles(machines, num_threads, dynamics=dynamics) if oracles is None else oracles
     kinds = [[machines[index] for index in indices] for indices in groups(machines)]
@@ -177,14 +187,14 @@ def compare(
 
 
 def so_far(machines: Sequence[SuiteMachine], tuners: Sequence[str], log: ShardLog) -> Comparison | None:
-    """Return the comparison on those machines that a run which was stopped has had all tuners tune; None if none."""
+    """Compare on those machines that all tuners had tuned before a run was stopped; None without such machines."""
     return _compared(machines, tuners, _rows_in(log))
 
 
 def _compared(
     machines: Sequence[SuiteMachine], tuners: Sequence[str], done: Mapping[int, Sequence[MachineRow]]
 ) -> Comparison | None:
-    """Return the comparison by the rows of tasks; on the machines that all tuners have tuned."""
+    """Compare by the rows of finished tasks, on the machines that all tuners have tuned; None without such machines."""
     found = {(row.tuner, row.machine): row for rows in done.values() for row in rows}
     common = [machine.name for machine in machines if all((name, machine.name) in found for name in tuners)]
     if not common:
@@ -205,14 +215,14 @@ class _Task(NamedTuple):
     trials: int | None
 
 
-Fresh = Iterator[tuple[int, list[MachineRow]]]  # the number of a task, and its rows
-Say = Callable[[_Task], None]  # called with a task that begins, or has come back
+Fresh = Iterator[tuple[int, list[MachineRow]]]  # number of a task, and its rows
+Say = Callable[[_Task], None]  # called with a task that begins, or that a pool has finished
 
 
 def _here(
     tasks: Sequence[_Task], left: Sequence[int], tuners: Mapping[str, Tuner], num_threads: int | None, say: Say
 ) -> Fresh:
-    """Do tasks one after the other; what a group needs is made once."""
+    """Run tasks one after the other; the bench of a group is shared by consecutive tasks."""
     with ExitStack() as open_now:
         bench: _Bench | None = None
         for k in left:
@@ -224,7 +234,7 @@ def _here(
 
 
 def _elsewhere(tasks: Sequence[_Task], left: Sequence[int], pool: Pool, say: Say) -> Fresh:
-    """Have tasks done by others, with the content of their files, in whatever order they come back."""
+    """Run tasks in a pool, with the content of their files, and yield them in the order in which they finish."""
     items = [
         tasks[k]._replace(group=[
             replace(one, **taken_options({"device": one.device, "load": one.load, "motor": one.motor}))
@@ -238,13 +248,13 @@ def _elsewhere(tasks: Sequence[_Task], left: Sequence[int], pool: Pool, say: Say
 
 
 def _run(task: _Task) -> str:
-    """Tune the machines of a group with a tuner; return the outcome as text."""
+    """Tune the machines of a group with a tuner; return the rows as text."""
     with closing(_Bench(task, 1)) as bench:
         return _text_of(bench.rows(task.tuner, find_tuner(task.tuner, task.trials, task.dynamics)))
 
 
 def _is_of(task: _Task, text: Any) -> bool:
-    """Return whether a text has the rows of a tuner on a group."""
+    """Return whether a text contains the rows of this tuner for this group."""
     rows = [(row.tuner, row.machine) for row in _rows_of(text)]
     return rows == [(task.tuner, machine.name) for machine in task.group]
 
@@ -262,7 +272,7 @@ def _rows_in(log: ShardLog | None) -> dict[int, list[MachineRow]]:
 
 
 class _Bench:
-    """The machines of a task's group, which tuners tune one after the other, each time fresh from the box."""
+    """The machines of a task's group, opened with factory settings for every tuner."""
 
     def __init__(self, task: _Task, num_threads: int | None) -> None:
         self.task, self._num_threads = task, num_threads
@@ -270,11 +280,11 @@ class _Bench:
         self._identified: tuple[list[Plant | str], float, Integers, DriveAudit] | None = None
 
     def close(self) -> None:
-        """Give the yardstick's machines back."""
+        """Close the yardstick's machines."""
         self._yardstick.close()
 
     def _tune(self, name: str, tuner: Tuner) -> tuple[Outcome | None, Integers, str, DriveAudit]:
-        """Return a tuner's outcome, or None and why; the gains it left, and what was counted meanwhile."""
+        """Return a tuner's outcome, None after an error; the gains left in the drives; the error; and the audit."""
         with open_group(self.task.group, self._num_threads) as target:
             audit = DriveAudit(target)
             watched = replace(target, drives=ObservedDrives(target.drives, audit))
@@ -288,7 +298,7 @@ class _Bench:
                     else:
                         outcome = tuner(watched, rng)
                     return outcome, _checked_gains(outcome, target), "", audit
-                except Exception as error:  # a tuner is anybody's code; the others are to be compared all the same
+                except Exception as error:  # a tuner may be foreign code that raises anything; the comparison goes on
                     return None, read_gains(target.drives), as_given(f"{type(error).__name__}: {error}"), audit
 
     def _propose(self, tuner: RuleTuner, target: Target, audit: DriveAudit) -> tuple[Outcome, DriveAudit]:
@@ -300,7 +310,7 @@ class _Bench:
         return tuner.propose(target, plants, before, seconds), audit
 
     def rows(self, name: str, tuner: Tuner) -> list[MachineRow]:
-        """Tune every machine with a tuner."""
+        """Tune every machine of the group with a tuner and judge the gains."""
         outcome, gains, failure, audit = self._tune(name, tuner)
         scores, worst = self._yardstick.score(gains), self._yardstick.margins(gains)
         asked, per_machine = self._yardstick.dynamics, self._yardstick.axes
@@ -343,7 +353,7 @@ class _Bench:
 
 
 def _checked_gains(outcome: Any, target: Target) -> Integers:
-    """Return a tuner's gains; ValueError if they are invalid, which is the tuner's mistake."""
+    """Return a tuner's gains; ValueError if their type or shape is wrong."""
     shape = (target.num_axes, target.device.gains.count)
     gains = np.asarray(outcome.gains)
     if not isinstance(outcome, Outcome) or gains.shape != shape or not np.issubdtype(gains.dtype, np.integer):

@@ -1,4 +1,4 @@
-"""The files of a comparison: its tables as CSV, its picture, and the settings that give it again."""
+"""The files of a comparison: tables as CSV, a picture, and the settings that repeat it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tuning.toml_tables import toml
 
 
 def save(comparison: Comparison, folder: Path, settings: Mapping[str, Any]) -> None:
-    """Write tuners.csv, rivals.csv, machines.csv, comparison.png, settings.toml and inputs/ into a folder there is."""
+    """Write tuners.csv, rivals.csv, machines.csv, comparison.png, settings.toml and inputs/ into an existing folder."""
     _write_csv(folder / "tuners.csv", comparison.tuners, TunerRow)
     _write_csv(folder / "rivals.csv", all_rivals(comparison), RivalRow)
     _write_csv(folder / "machines.csv", comparison.rows, MachineRow)
@@ -26,20 +26,20 @@ def save(comparison: Comparison, folder: Path, settings: Mapping[str, Any]) -> N
 
 
 def settings_text(settings: Mapping[str, Any]) -> str:
-    """Return settings as TOML, with the hashes of the inputs among them; what is None is left out."""
+    """Return settings as TOML, with the hashes of the user's files; settings that are None are omitted."""
     lines = [f"{name} = {toml(as_kept(value))}" for name, value in settings.items() if value is not None]
     return "\n".join([*lines, *table_of(inputs_in(settings))]) + "\n"
 
 
 def _write_csv(path: Path, rows: Sequence[Any], kind: type) -> None:
     names = [field.name for field in fields(kind)]
-    # A mapping has a column for each of its names, which are those of the first row.
+    # A mapping becomes one column per key; the keys of the first row count.
     table = [_columns({name: getattr(row, name) for name in names}) for row in rows]
     write_table(path, [table[0] if table else names, *([_cell(value) for value in row.values()] for row in table)])
 
 
 def _columns(row: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a row with the values of its mappings in their place."""
+    """Replace the mappings of a row by their entries."""
     found: dict[str, Any] = {}
     for name, value in row.items():
         found |= value if isinstance(value, Mapping) else {name: value}

@@ -15,11 +15,11 @@ if TYPE_CHECKING:
     from tuning.compare.comparison import Comparison
 
 KEPT, BROKEN, MARK = "#0072b2", "#d55e00", "black"
-ROW = 0.36  # inches of a tuner
+ROW = 0.36  # inches per tuner
 
 
 def draw(comparison: Comparison, path: Path) -> None:
-    """Draw a comparison into a PNG file."""
+    """Draw a comparison to a PNG file."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
@@ -30,7 +30,7 @@ def draw(comparison: Comparison, path: Path) -> None:
     score, phase, time, trouble = figure.subplots(1, 4, sharey=True, width_ratios=(5, 3, 2, 2))
     for place, tuner in enumerate(tuners):
         rows = comparison.of(tuner.tuner)
-        # Machines side by side where they agree, in the order of the suite: nothing is drawn at random.
+        # Machines with equal values are drawn side by side, in the order of the suite: the picture has no random part.
         aside = place + 0.5 * (np.arange(len(rows)) % 7 / 6.0 - 0.5)
         kept = np.array([row.kept for row in rows])
         for axes, values in ((score, [row.relative for row in rows]), (phase, [row.phase_deg for row in rows])):

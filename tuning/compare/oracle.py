@@ -1,13 +1,13 @@
-"""The constrained oracle of emulated machines: the best gains that keep the constraints, by search on their truth.
+"""The constrained oracle of emulated machines: the best gains that keep the constraints, by search on the truth.
 
-No tuner can know them. They are searched on the true machine by its true robust cost: random sets of gains over all
-bandwidths, then differential evolution (Storn and Price, doi:10.1023/A:1008202821328, with the steps towards the best
-of JADE, doi:10.1109/TEVC.2009.2014613). All axes of a machine get their gains together. The current loop is not
-searched beyond the crossover that leaves it 60 degrees, nor below 0.3 of that, since the constraints are those of the
-outer loops.
+No tuner can find them by experiments. They are searched on the true machine by its true robust cost: random sets of
+gains over all bandwidths, then differential evolution (Storn and Price, doi:10.1023/A:1008202821328, with the steps
+towards the best of JADE, doi:10.1109/TEVC.2009.2014613). The gains of all axes of a machine are searched together. The
+crossover of the current loop is limited to between 0.3 and 1 times that with 60 degrees of phase margin, since the
+constraints are those of the outer loops.
 
-The gains of the suites' machines for standard dynamics are kept in oracles.csv; what they are worth is scored anew
-whenever they are used, so that a row that no longer fits its machine or the score is noticed, and searched anew.
+The gains of the suites' machines for standard dynamics are stored in oracles.csv. They are scored again whenever they
+are used: a row that no longer fits its machine or the score is detected, and searched again.
 """
 
 from __future__ import annotations
@@ -34,20 +34,21 @@ from tuning.compare.yardstick import REPEATS, Yardstick
 
 KEPT = Path(__file__).with_name("oracles.csv")
 HEAD = ("device", "machine", "digest", "gains", "performance", "slack")
-STALE = 0.05  # relative: a kept performance that is off by more than this is one of another score
-POPULATION, REPEATED = 48, 3  # sets of gains, and runs of each, to other places and with another noise
+STALE = 0.05  # relative: a stored performance that differs by more belongs to an outdated score
+POPULATION, REPEATED = 48, 3  # sets of gains, and runs of each with other moves and noise
 DRAWS = 2304  # random sets of a machine of one axis; fewer with more axes
-GENERATIONS = {1: 45, 2: 45}  # by axes
-MANY_AXES = 12  # generations of a machine of more axes, each of which takes seconds
-BANDS = 16  # of bandwidth, each of which has its best draws in the first population
-# Draws over the baseline rule's gains, natural logarithms: of all outer gains together, and of each gain on its own.
+GENERATIONS = {1: 45, 2: 45}  # by number of axes
+MANY_AXES = 12  # generations for machines with more axes: each takes seconds
+BANDS = 16  # of bandwidth; the best draws of each are in the first population
+# Natural logarithms of the draws' gains over the baseline rule's: of all outer gains together, and of each one
+# separately.
 TOGETHER, EACH = (-2.5, 2.2), (-1.2, 1.2)
 FINALISTS = 16  # of the last population, scored with all repeats
-SPREAD = 0.01  # relative cost within the better half of the population at which it has converged
+SPREAD = 0.01  # relative spread of cost in the better half of the population at which the search ends
 
 
 class Oracle(NamedTuple):
-    """The best gains of a machine, raw, (axes, count), their robust performance, and their slack."""
+    """The best gains of a machine, raw, shape (axes, count), their robust performance, and their slack."""
 
     gains: Integers
     performance: float
@@ -61,16 +62,16 @@ def find_oracles(
     kept: Path | None = KEPT,
     dynamics: str | Dynamics = DEFAULT,
 ) -> dict[str, Oracle]:
-    """Return the oracles of machines by name: those that are kept and still true, and those that are searched.
+    """Return the oracles of machines by name: the stored ones that are still valid, and newly searched ones.
 
-    For other than standard dynamics none are kept.
+    Oracles are stored for standard dynamics only.
 
     Args:
-        machines: Of a suite, or of your own.
-        num_threads: As `EmulatedDrives` takes it.
+        machines: Machines of a suite, or your own.
+        num_threads: As in `EmulatedDrives`.
         progress: Called with the share that is done.
-        kept: The file of those that are kept; None searches all.
-        dynamics: What the loops must keep.
+        kept: File of the stored oracles; None searches all.
+        dynamics: Requirements on the loops.
     """
     rows = {} if kept is None or not are_kept(dynamics) else read_oracles(kept)
     found: dict[str, Oracle] = {}
@@ -82,7 +83,7 @@ def find_oracles(
             scores = yardstick.score(gains)
         for k, machine in enumerate(group):
             row, now = rows[digest(machine)], float(scores.performance[k])
-            # Of a machine that no gains satisfy the row stays true as it is.
+            # If no gains keep a machine's constraints, its row stays valid.
             if (scores.slack[k] > 0.0 or row.slack <= 0.0) and abs(now / row.performance - 1.0) < STALE:
                 found[machine.name] = row._replace(performance=now, slack=float(scores.slack[k]))
     left = [machine for machine in machines if machine.name not in found]
@@ -94,16 +95,16 @@ def find_oracles(
 
 
 def are_kept(dynamics: str | Dynamics) -> bool:
-    """Return whether the file has oracles for these dynamics."""
+    """Return whether the file stores oracles for these dynamics."""
     return replace(find_dynamics(dynamics), name=DEFAULT) == find_dynamics(DEFAULT)
 
 
 def search_oracle(
     machine: SuiteMachine, num_threads: int | None = None, seed: int = 0, dynamics: str | Dynamics = DEFAULT
 ) -> Oracle:
-    """Return the oracle of a machine; the seed draws what is tried."""
+    """Search the oracle of a machine; the seed determines the random draws."""
     rng = np.random.default_rng(seed)
-    # Gains that rest in a few places may hunt in others: where all do, every run counts in the search, too.
+    # Gains that come to rest at some positions may limit-cycle at others: if all do, the search counts every run.
     for repeats in (REPEATED, REPEATS):
         with closing(Yardstick([machine], num_threads, repeats, POPULATION, dynamics)) as yardstick:
             last = _evolved(yardstick, _Box.of(yardstick), rng)
@@ -116,7 +117,7 @@ def search_oracle(
 
 
 class _Box(NamedTuple):
-    """Where gains are searched: logarithms of raw gains, (axes, count). outer: Columns beyond the current loop."""
+    """The searched range: logarithms of raw gains, shape (axes, count). outer: Columns of the outer loops."""
 
     rule: Floats
     least: Floats
@@ -125,7 +126,7 @@ class _Box(NamedTuple):
 
     @classmethod
     def of(cls, yardstick: Yardstick) -> _Box:
-        """Return that of a machine."""
+        """Return the range for a machine."""
         device, axes = yardstick.device, yardstick.axes
         rule = np.log(np.maximum(yardstick.rule_gains[:axes], 1).astype(float))
         least, most = np.zeros_like(rule), np.log(np.broadcast_to(device.gains.highest, rule.shape).astype(float))
@@ -139,7 +140,7 @@ class _Box(NamedTuple):
                     scales["current", "P"].raw(CURRENT_CROSSOVER * device.current_rate / CURRENT_LAG * L)
                 )
                 least[axis, p] = most[axis, p] + np.log(LEAST_TORQUE)
-                # Zeros at the winding's pole.
+                # Zero of the PI at the pole of the winding.
                 least[axis, i] = most[axis, i] = rule[axis, i] = np.log(
                     max(float(scales["current", "I"].raw(R / L)), 1.0)
                 )
@@ -147,12 +148,12 @@ class _Box(NamedTuple):
         return cls(rule, least, most, outer)
 
     def whole(self, x: Floats) -> Integers:
-        """Return raw gains of points, (points, axes, count)."""
+        """Convert points to raw gains, shape (points, axes, count)."""
         return np.rint(np.exp(np.clip(x, self.least, self.most))).astype(np.int64)
 
 
 def _evolved(yardstick: Yardstick, box: _Box, rng: np.random.Generator) -> Integers:
-    """Return the last population, the best first, (sets, axes, count)."""
+    """Return the last population, shape (sets, axes, count), the best first."""
 
     def cost(x: Floats) -> Floats:
         gains = box.whole(x)
@@ -168,7 +169,7 @@ def _evolved(yardstick: Yardstick, box: _Box, rng: np.random.Generator) -> Integ
         best = x[order[rng.integers(0, n // 8, n)]]
         first, second = x[rng.integers(0, n, n)], x[rng.integers(0, n, n)]
         F = rng.uniform(0.4, 0.9, (n, 1, 1))
-        # Every other time one axis alone: what suits an axis may not suit another.
+        # Half of the trials change one axis only: what suits an axis may not suit another.
         alone = np.arange(axes) == rng.integers(0, axes, (n, 1))
         crossed = (rng.random((n, 1)) < 0.5) | alone
         new = np.where(crossed[..., None], x + F * (best - x) + F * (first - second), x)
@@ -180,12 +181,12 @@ def _evolved(yardstick: Yardstick, box: _Box, rng: np.random.Generator) -> Integ
 
 
 def _first(yardstick: Yardstick, box: _Box, rng: np.random.Generator) -> Floats:
-    """Return the first population: of draws of all bandwidths those that promise most and keep the constraints."""
+    """Return the first population: in each band of bandwidth the most promising draws that keep the constraints."""
     rounds = max(DRAWS // (POPULATION * yardstick.axes), 4)
     shape = (rounds * POPULATION, *box.rule.shape)
     together = rng.uniform(*TOGETHER, (shape[0], 1, 1)) * box.outer
     powers = yardstick.device.gains.powers
-    # All axes of a machine at the same place in their own scales.
+    # The same draw for all axes of a machine, in each axis' own scale.
     reach = powers * (together + rng.uniform(*EACH, (shape[0], 1, shape[2])))
     x = np.clip(box.rule + reach, box.least, box.most)
     gains = box.whole(x)
@@ -200,12 +201,12 @@ def _first(yardstick: Yardstick, box: _Box, rng: np.random.Generator) -> Floats:
 
 # --- the file ---------------------------------------------------------------------------------------------------------
 def digest(machine: SuiteMachine) -> str:
-    """Return a hash of the name and all parameters of a machine."""
+    """Return a hash of all fields of a machine."""
     return hashlib.sha256(repr(machine).encode()).hexdigest()[:16]
 
 
 def read_oracles(path: Path = KEPT) -> dict[str, Oracle]:
-    """Return the oracles that a file keeps, by the digest of their machine."""
+    """Read oracles from a file, by the digest of their machine."""
     found = {}
     for _, _, key, gains, performance, slack in islice(read_rows(path), 1, None):
         axes = np.array([axis.split() for axis in gains.split("|")], np.int64)
@@ -214,7 +215,7 @@ def read_oracles(path: Path = KEPT) -> dict[str, Oracle]:
 
 
 def write_oracles(path: Path, machines: Iterable[SuiteMachine], oracles: dict[str, Oracle]) -> None:
-    """Write the oracles of machines: the gains of an axis in the order of the drive's set, axes parted by |."""
+    """Write the oracles of machines: gains of an axis in the order of the drive's set, axes separated by |."""
     rows = []
     for machine in machines:
         found = oracles[machine.name]

@@ -1,4 +1,4 @@
-"""Rules side by side: the proposal of each for an identified axis, with the margins that it would have."""
+"""Compares rules: the proposal of each for an identified axis, with its margins by the model."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ if TYPE_CHECKING:
     from tuning.rules.proposal import Proposal
     from tuning.target import Target
 
-POINTS = 1500  # frequencies at which margins are looked for
+POINTS = 1500  # frequencies at which margins are computed
 
 
 @dataclass
 class AxisRules:
-    """The results of an axis: its model, or the reason why it has none, and the rules' proposals.
+    """The results of an axis: its model, or the reason for a missing one, and the rules' proposals.
 
-    unswung: Why the relay says nothing.
+    unswung: Why the relay experiment has no result.
     """
 
     plant: Plant | str
@@ -38,7 +38,7 @@ class AxisRules:
 
 
 def identified_plants(target: Target, progress: Progress) -> tuple[list[Identification], list[Plant | str]]:
-    """Identify axes; return their models, too, or the reason for an axis without one: no inertia was identified."""
+    """Identify axes; return the identifications and their models, or the reason for a missing one (no inertia)."""
     from tuning.identify.identification import identify
 
     with swinging_allowed(target.drives):
@@ -54,12 +54,12 @@ def identified_plants(target: Target, progress: Progress) -> tuple[list[Identifi
 
 
 def proposals(target: Target, plant: Plant, names: Sequence[str]) -> dict[str, Proposal]:
-    """Return the proposals of rules by name."""
+    """Compute the proposals of rules by name."""
     return {name: propose(name, target.device, target.motor, plant) for name in names}
 
 
 def swung_proposals(target: Target, plants: Sequence[Plant]) -> list[Proposal | str]:
-    """Return the relay experiments' proposals, with the rule's current loops, or the reason for a missing one."""
+    """Run relay experiments with the rule's current loops; return their proposals, or the reason for a missing one."""
     from tuning.rules.relay import gains_from_swing, relay_experiment, relay_rule
 
     before = read_gains(target.drives)
@@ -75,19 +75,19 @@ def swung_proposals(target: Target, plants: Sequence[Plant]) -> list[Proposal | 
             if reason := swing.reason[axis]:
                 raise ValueError(reason)
             found.append(gains_from_swing(target.device, plant, float(swing.slope[axis]), swing.ultimate(axis)))
-        except ValueError as error:  # also from gains_from_swing: it was the load's resonance that swung
+        except ValueError as error:  # raised also by gains_from_swing: it was the load's resonance that oscillated
             found.append(str(error))
     return found
 
 
 def outer_margins(device: Device, plant: Plant, gains: Sequence[int]) -> dict[str, Margins]:
-    """Return the margins of the velocity and of the position loop, as the model has them with gains."""
+    """Compute the margins of velocity and position loop with the model and gains."""
     f = np.geomspace(0.5, 0.49 * device.velocity_rate, POINTS)
     return {loop: margins(f, OPEN_LOOPS[loop](device, plant, gains, f)) for loop in ("velocity", "position")}
 
 
 def slacks(target: Target, plant: Plant, rows: Mapping[str, Proposal], dynamics: Dynamics) -> dict[str, float]:
-    """Return how far proposals keep the dynamics by the model of the axis and its variants, relative, by name."""
+    """Return the relative slack of proposals to the dynamics, by the model of the axis and its variants, by name."""
     from tuning.auto.loop_model import model_of
 
     gains = np.array([row.gains for row in rows.values()], np.int64)

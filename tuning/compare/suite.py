@@ -1,8 +1,8 @@
-"""The machines that tuners are compared on: a public part in a TOML file, and one that is drawn for a seed.
+"""The machines that tuners are compared on: a public part in a TOML file, and a part drawn from a seed.
 
-A suite is a file of `suites/`, or your own: tables of machines, one per load and motor, and which loads and motors the
-drawn part turns. Paths in it are relative to it. A machine is known by its name: it is the same whatever else is opened
-beside it.
+A suite is a file of `suites/`, or your own: tables of machines, one per load and motor, and the loads and motors of the
+drawn part. Paths in it are relative to the file. The name of a machine determines its noise: it behaves the same
+whatever other machines are opened with it.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from tuning.toml_tables import ExperimentError, as_table, as_value, check_keys, 
 
 SHIPPED = Path(__file__).parent / "suites"
 FRICTION = "stribeck"
-_TRIES = 50  # draws until a machine is one that its motor can move
+_TRIES = 50  # draws until the motor can move the machine
 _GROUP = ("load", "motor", "friction", "supply", "travel", "parameters")
-_SUPPLY = "supply.voltage"  # the law's name in a set of distributions
+_SUPPLY = "supply.voltage"  # key of the supply voltage in a set of distributions
 
 
 @dataclass(frozen=True)
@@ -44,12 +44,12 @@ class SuiteMachine:
     """A machine of a suite.
 
     Attributes:
-        name: Its own in the suite.
-        device, load, motor: Names.
-        parameters: True parameters that are not their defaults, by the names of `drives.machine.parameters` [SI].
-        supply: Voltage [V].
+        name: Its name in the suite.
+        device, load, motor: Their names.
+        parameters: True parameters that differ from the defaults, by the names of `drives.machine.parameters` [SI].
+        supply: Supply voltage [V].
         friction: Model of the load's friction, as in EmulatedDrives.
-        travel: How far the rotor may turn from where it stands, to each side [rev]; inf is the load's own way.
+        travel: How far the rotor may turn to each side of its first angle [rev]; inf is the load's own travel.
     """
 
     name: str
@@ -63,12 +63,12 @@ class SuiteMachine:
 
     @property
     def kind(self) -> tuple[str, str, str, str]:
-        """What machines must have in common to be emulated in one set of drives."""
+        """The fields that must be equal in machines emulated in one set of drives."""
         return self.device, self.load, self.motor, self.friction
 
 
 def suite_input(name: str) -> str:
-    """Return a suite's name as it is, or an `Input` of its file and all that its machines name; raises as `taken`."""
+    """Return a shipped suite's name unchanged, else an `Input` of the file and all it names; raises as `taken`."""
     if not is_path("suite", name):
         return name
     named = [one for what, place in _own_names(Path(name)) for one in files_of(what, place)]
@@ -77,7 +77,7 @@ def suite_input(name: str) -> str:
 
 
 def _own_names(path: Path) -> list[tuple[str, Path]]:
-    """Return the paths among a suite's names: device, motor or load, and where it is; raises as `load_suite` does."""
+    """Return the paths in a suite's file, each with its kind (device, motor or load); raises as `load_suite`."""
     table = _read(path)
     rows = [row for row in table.get("group", []) if isinstance(row, dict)]
     found = [("device", table.get("device")), *((what, row.get(what)) for row in rows for what in ("motor", "load"))]
@@ -89,22 +89,22 @@ def _own_names(path: Path) -> list[tuple[str, Path]]:
 
 
 def suite_names() -> list[str]:
-    """Return the names of the suites that ship."""
+    """Return the names of the shipped suites."""
     return sorted(path.stem for path in SHIPPED.glob("*.toml"))
 
 
 def load_suite(name_or_path: str | Path = "public", seed: int | None = None, count: int | None = None) -> tuple[
     SuiteMachine, ...
 ]:  # fmt: skip
-    """Return the machines of a suite: its public part, and with a seed the part that is drawn for it.
+    """Return the machines of a suite: its public part, and with a seed also its drawn part.
 
     Args:
-        name_or_path: A shipped suite by its name, or a TOML file.
-        seed: Of the drawn part; None leaves it out.
-        count: How many machines at most, taken from all loads and motors in turn.
+        name_or_path: Name of a shipped suite, or path of a TOML file.
+        seed: Seed of the drawn part; None omits it.
+        count: Greatest number of machines, taken from all loads and motors in turn.
 
     Raises:
-        ExperimentError: For an unknown suite, key, name or number; the text lists those there are.
+        ExperimentError: For an unknown suite, key, name or number; the message lists the known ones.
     """
     path = _path(name_or_path)
     table = _read(path)
@@ -128,7 +128,7 @@ def load_suite(name_or_path: str | Path = "public", seed: int | None = None, cou
 
 
 def groups(machines: Sequence[SuiteMachine]) -> list[list[int]]:
-    """Return the indices of machines that can be emulated in one set of drives, in the order of their first."""
+    """Return the indices of machines that can be emulated in one set of drives, in the order of the first of each."""
     found: dict[tuple[str, str, str, str], list[int]] = {}
     for k, machine in enumerate(machines):
         found.setdefault(machine.kind, []).append(k)
@@ -136,10 +136,10 @@ def groups(machines: Sequence[SuiteMachine]) -> list[list[int]]:
 
 
 def open_group(machines: Sequence[SuiteMachine], num_threads: int | None = None) -> Target:
-    """Return machines of one kind as one target.
+    """Open machines of one kind as one target.
 
     Raises:
-        ValueError: If they are of several kinds, or one cannot be.
+        ValueError: If they are of several kinds, or one is impossible.
     """
     if len({machine.kind for machine in machines}) != 1:
         kinds = ", ".join(sorted({f"{machine.load} on {machine.motor}" for machine in machines}))
@@ -155,7 +155,7 @@ def open_group(machines: Sequence[SuiteMachine], num_threads: int | None = None)
     )
     axes = drives.load.num_axes
     supply = np.repeat([machine.supply for machine in machines], axes)
-    # A machine's noise is its own, whatever stands beside it.
+    # The noise of a machine depends on its name only, not on the machines opened with it.
     drives.machine.seed_noise(np.array([1.0 + zlib.crc32(machine.name.encode()) % (2**32 - 2) for machine in machines]))
     drives.machine.supply = supply
     drives.machine.reset()  # charges the link from the supply
@@ -202,12 +202,12 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _located(what: str, name: str, folder: Path) -> Path | None:
-    """Return where a name that is a path, which is relative to the suite's file, lies; None for other names."""
+    """Resolve a path that is relative to the suite's file; None for a name that is not a path."""
     return folder / name if is_path(what, str(folder / name)) and not is_shipped(what, name) else None
 
 
 def _named(what: str, name: str, folder: Path) -> str:
-    """Resolve a name of a suite; of a path read the content, which then travels with the machine."""
+    """Return a name of a suite unchanged, or the content of the file it names, which then stays with the machine."""
     try:
         return name if (place := _located(what, name, folder)) is None else taken(what, place)
     except ValueError as error:
@@ -215,12 +215,12 @@ def _named(what: str, name: str, folder: Path) -> str:
 
 
 def _stem(load: str, motor: str) -> str:
-    """Return load and motor for a machine's name, from which it draws: of paths the files' names, wherever they lie."""
+    """Return the part of a machine's name, and so of its seed, for load and motor; of files without their folder."""
     return "-".join(Path(name).stem if name.endswith((".toml", *MODEL_ENDINGS)) else name for name in (load, motor))
 
 
 def _group(where: str, device: str, row: dict[str, Any], folder: Path) -> list[SuiteMachine]:
-    """Return the machines of a table whose columns they are; its paths are relative to the folder."""
+    """Return the machines of a table with one column per machine; paths are relative to the folder."""
     check_keys(f"{where}: group", row, list(_GROUP), optional=("friction", "travel"))
     names = {key: as_value(f"{where}: {key}", row[key], "str") for key in ("load", "motor")}
     stem = _stem(*names.values())
@@ -251,7 +251,7 @@ def _group(where: str, device: str, row: dict[str, Any], folder: Path) -> list[S
 
 
 def _numbers(where: str, value: Any, count: int | None = None) -> list[float]:
-    """Return an array of numbers; count is how many there must be."""
+    """Check an array of numbers; `count` is its length, None for any."""
     if not isinstance(value, list) or not value:
         raise ExperimentError(f"{where} = {value!r} must be an array of numbers, one per machine")
     if count is not None and len(value) != count:
@@ -268,16 +268,16 @@ def _checked_defaults(where: str, device: str, load: str, motor: str) -> dict[st
 
 @cache
 def _defaults(device: str, load: str, motor: str) -> dict[str, float]:
-    """Return the default of every parameter of a machine; they never change, and take a load's compilation."""
+    """Return the default of every parameter of a machine; cached, since it takes a load's compilation."""
     find_motor(motor), find_load(load)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", MisfitWarning)  # of the default machine, which may not be one of ours
+        warnings.simplefilter("ignore", MisfitWarning)  # of the default machine, which may not be in the suite
         with EmulatedDrives(device, load, motor, num_threads=1) as drives:
             return {name: float(value[0]) for name, value in drives.machine.parameters.items()}
 
 
 def _spread(machines: Sequence[SuiteMachine], count: int) -> tuple[SuiteMachine, ...]:
-    """Return so many machines, taken from the groups in turn, in the order they had."""
+    """Choose `count` machines from the groups in turn; their order stays."""
     if count < 1:
         raise ExperimentError(f"count must be 1 or more, not {count}")
     members = groups(machines)
@@ -288,7 +288,7 @@ def _spread(machines: Sequence[SuiteMachine], count: int) -> tuple[SuiteMachine,
 
 # --- drawing ----------------------------------------------------------------------------------------------------------
 def _generated(where: str, device: str, tables: Any, seed: int, folder: Path) -> list[SuiteMachine]:
-    """Return the machines that are drawn for a seed; one that its motor cannot move is drawn again."""
+    """Draw the machines for a seed; one that its motor cannot move is drawn again."""
     if seed < 0:
         raise ExperimentError(f"seed must be 0 or more, not {seed}")
     if not isinstance(tables, list):
@@ -300,7 +300,7 @@ def _generated(where: str, device: str, tables: Any, seed: int, folder: Path) ->
         pairs = table["groups"]
         if not isinstance(pairs, list) or not pairs or any(not isinstance(p, list) or len(p) != 2 for p in pairs):
             raise ExperimentError(f"{where}: groups must be an array of [load, motor]")
-        # Numbered on from table to table: one that is added changes no machine of those before it.
+        # Numbered across tables: adding a table changes no machine of the tables before it.
         first = len(machines)
         for k in range(count):
             load, motor = pairs[k % len(pairs)]
@@ -309,7 +309,7 @@ def _generated(where: str, device: str, tables: Any, seed: int, folder: Path) ->
 
 
 def _draw(where: str, device: str, load: str, motor: str, seed: int, number: int) -> SuiteMachine:
-    """Return machine `number` of a seed; it does not depend on how many others are drawn."""
+    """Draw machine `number` of a seed; it does not depend on the number of machines drawn."""
     defaults = _checked_defaults(where, device, load, motor)
     if load not in shipped():
         raise ExperimentError(f"{where}: load {load!r} has no distributions; there are {', '.join(shipped())}")
@@ -327,7 +327,7 @@ def _draw(where: str, device: str, load: str, motor: str, seed: int, number: int
 
 
 def _sound(device: str, load: str, motor: str, parameters: Mapping[str, float]) -> bool:
-    """Return whether the motor can move the machine, and the machine can be stepped."""
+    """Return whether the motor can move the machine, and the machine can be simulated."""
     with warnings.catch_warnings():
         warnings.simplefilter("error", MisfitWarning)
         try:

@@ -1,6 +1,6 @@
-"""The tuners by name: each finds gains for a target, through its drives only.
+"""The tuners by name: each finds gains for a target by using its drives only.
 
-A tuner from elsewhere, a trained agent for one, registers in the entry-point group `drive_env.tuners`: a function of a
+A foreign tuner, for example a trained agent, registers in the entry-point group `drive_env.tuners`: a function of a
 `Target` and a random generator that returns an `Outcome`.
 """
 
@@ -32,9 +32,11 @@ ENTRY_POINTS = "drive_env.tuners"
 
 
 class TunerKind(NamedTuple):
-    """A tuner of the registry: a line of description, and whether it is slow, so that it runs only if named.
+    """A tuner of the registry: its name, a line of description, and its factory.
 
-    searches: `make` takes the number of trials. asked: It takes the dynamics.
+    slow: Runs only if it is named.
+    searches: `make` takes the number of trials.
+    asked: `make` takes the dynamics.
     """
 
     name: str
@@ -46,11 +48,11 @@ class TunerKind(NamedTuple):
 
 
 class MissingTunerError(ValueError):
-    """There is no such tuner, or it lacks what it needs; the message has the remedy."""
+    """The tuner does not exist, or lacks a package; the message has the remedy."""
 
 
 def tuner_rows() -> dict[str, TunerKind]:
-    """Return all tuners by name: those of this package, the rules, and those that others have registered."""
+    """Return all tuners by name: those of this package, the rules, and those registered by other packages."""
     rows = {row.name: row for row in _OWN}
     rows |= {name: TunerKind(name, f"rule {name}", partial(RuleTuner, name)) for name in _rules()}
     rows |= {row.name: row for row in _AFTER}
@@ -66,15 +68,15 @@ def tuner_rows() -> dict[str, TunerKind]:
 
 
 def find_tuner(name: str, trials: int | None = None, dynamics: str | Dynamics = DEFAULT) -> Tuner:
-    """Return a tuner by name.
+    """Look up a tuner by name.
 
     Args:
-        name: Its name.
-        trials: How many a search makes; its own number by default. What does not search has none.
-        dynamics: What the loops must keep, for tuners that can be asked.
+        name: Name of the tuner.
+        trials: Number of trials of a search; its own number by default. Ignored for tuners without search.
+        dynamics: Requirements on the loops, for tuners that accept them.
 
     Raises:
-        MissingTunerError: For an unknown name, listing those there are, or a package that is missing.
+        MissingTunerError: For an unknown name, listing the known ones, or a missing package.
     """
     rows = tuner_rows()
     if name not in rows:
@@ -87,12 +89,12 @@ def find_tuner(name: str, trials: int | None = None, dynamics: str | Dynamics = 
 
 # --- tuners without a search ------------------------------------------------------------------------------------------
 def _factory(target: Target, rng: np.random.Generator) -> Outcome:
-    """Leave the gains that the drive was commissioned with."""
+    """Keep the gains that the drive was commissioned with."""
     return _outcome(target, read_gains(target.drives))
 
 
 def _baseline(target: Target, rng: np.random.Generator) -> Outcome:
-    """Take the baseline rule's gains for the inertia that two moves show."""
+    """Write the baseline rule's gains for the inertia that is identified in two moves."""
     with timed(target) as (watched, clock):
         bench = TrialBench(watched)
         bench.identify()
@@ -103,8 +105,8 @@ def _baseline(target: Target, rng: np.random.Generator) -> Outcome:
 class RuleTuner:
     """A rule of `tuning.rules.rules_by_name` as a tuner: identify, compute, write.
 
-    The identification does not depend on the rule: for several rules on the same machines, identify once and have each
-    propose.
+    The identification does not depend on the rule: for several rules on the same machines, identify once and call
+    `propose` of each.
     """
 
     def __init__(self, name: str) -> None:
@@ -119,7 +121,7 @@ class RuleTuner:
         return outcome
 
     def propose(self, target: Target, plants: Sequence[Plant | str], before: Integers, seconds: float = 0.0) -> Outcome:
-        """Return the gains for axes' models; an axis without one keeps those before, and has the reason as its note."""
+        """Compute gains for axes' models; an axis without a model keeps its gains, and its note has the reason."""
         gains, notes = before.copy(), []
         for axis, plant in enumerate(plants):
             if isinstance(plant, str):
@@ -132,7 +134,7 @@ class RuleTuner:
 
 
 def identify_all(target: Target) -> tuple[list[Plant | str], float]:
-    """Identify a target; return models of its axes, as `identified_plants` does, and the drive time [s]."""
+    """Identify a target; return the models of its axes as in `identified_plants`, and the drive time [s]."""
     from tuning.compare.side_by_side import identified_plants
 
     with timed(target) as (watched, clock):
@@ -147,13 +149,12 @@ def _rules() -> Mapping[str, Callable[..., Proposal]]:
 
 
 def _auto(dynamics: str | Dynamics) -> Tuner:
-    """Return the tuner of `tuning.auto.one_button`."""
     return partial(importlib.import_module("tuning.auto.one_button").tune, dynamics=dynamics)
 
 
 # --- searches ---------------------------------------------------------------------------------------------------------
 def search_tuner(target: Target, rng: np.random.Generator, **settings: Any) -> Outcome:
-    """Search gains by trials; `settings` are those of `optimise.Settings`."""
+    """Search gains by trials; `settings` are fields of `optimise.Settings`."""
     found = optimise(target, Settings(seed=int(rng.integers(2**31)), **settings))
     notes = tuple(note for note in found.notes for _ in range(target.axes_per_machine))
     return _outcome(target, found.gains, found.drive_seconds, moves=found.moves, aborts=found.aborts, notes=notes)
@@ -168,7 +169,6 @@ def _search(sampler: str, trials: int, safe: bool = False) -> Tuner:
 
 
 def _load(entry: importlib.metadata.EntryPoint) -> Tuner:
-    """Return a registered tuner."""
     try:
         found: Tuner = entry.load()
     except Exception as error:  # a foreign module may raise anything when it is imported
@@ -199,7 +199,7 @@ _AFTER = (
 
 
 def _outcome(target: Target, gains: Integers, seconds: float = 0.0, **counted: Any) -> Outcome:
-    """Return gains and drive time as an outcome, and what was counted; of all else nothing."""
+    """Return an outcome with gains, drive time and the given counts; all other counts are 0."""
     count = target.num_axes
     rest = dict.fromkeys(("moves", "aborts", "violations"), np.zeros(count, np.int64)) | {"notes": ("",) * count}
     return Outcome(gains, np.full(count, seconds), **(rest | counted))

@@ -1,4 +1,4 @@
-"""What gains are worth on machines whose truth is known: robust performance, constraints, and margins of the loops."""
+"""Judges gains on machines with known parameters: robust performance, constraints, and margins of the loops."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from mechanics.arrays import Floats, Integers
 from tuning.compare.suite import SuiteMachine, open_group
 from tuning.identify.moved_inertia import true_inertia
 
-# Runs of every machine and variant, each with a noise of its own, whose scores are averaged: with one run, the same
-# gains get a score that differs by 10 % on some machines.
+# Number of runs of every machine and variant, each with its own noise, whose scores are averaged: with one run, the
+# score of the same gains differs by 10 % on some machines.
 REPEATS = 16
 
 
 class Yardstick:
-    """Judges gains on the machines of a group, as they truly are.
+    """Judges gains on the machines of a group with their true parameters.
 
     Args:
         group: Machines of one kind.
-        num_threads: As `EmulatedDrives` takes it.
-        repeats: As `RobustScore` takes it.
-        copies: Copies of each machine, which follow each other; each may have gains of its own.
-        dynamics: What the loops must keep.
+        num_threads: As in `EmulatedDrives`.
+        repeats: As in `RobustScore`.
+        copies: Consecutive copies of each machine; each may have its own gains.
+        dynamics: Requirements on the loops.
     """
 
     def __init__(
@@ -75,11 +75,11 @@ class Yardstick:
         )
 
     def score(self, gains: Integers) -> Scores:
-        """Return the scores of every copy, gains being raw, (num_machines * axes, count)."""
+        """Return the scores of every copy for raw gains, shape (num_machines * axes, count)."""
         return self._score.score(gains)
 
     def loop_slack(self, gains: Integers) -> Floats:
-        """Return how far the loops keep the constraints on the machines as they are alone; infinite without a model."""
+        """Return the slack of the loops to the constraints on the nominal machines; infinite without a linear model."""
         if self._linear is None:
             return np.full(len(gains) // self.axes, np.inf)
         return self._score.loop_slack(gains, nominal=True)
@@ -93,5 +93,5 @@ class Yardstick:
         return worst_margins(LoopRates.of(self.device), self._linear, CascadeGains.of(self.device, raw))
 
     def close(self) -> None:
-        """Give the machines back."""
+        """Close the machines."""
         self._score.close()

@@ -1,4 +1,4 @@
-"""95 % intervals, from scatter and from systematic errors."""
+"""95 % intervals, from random scatter and from systematic errors."""
 
 from __future__ import annotations
 
@@ -17,15 +17,16 @@ LEVEL = 0.95
 
 
 def t_quantile(freedom: float) -> float:
-    """Return Student's two-sided quantile of `LEVEL` for so many degrees of freedom, at least one."""
+    """Return Student's two-sided quantile of `LEVEL` for degrees of freedom, at least one."""
     return float(stats.t.ppf(0.5 * (1.0 + LEVEL), max(freedom, 1.0)))
 
 
 def gain_error(device: Device, motor: Motor, *, turns: bool = True) -> float:
-    """Return the share by which all measured currents may be wrong: the gain errors of the sensors, 95 %.
+    """Return the greatest relative error of all measured currents (95 %): the gain errors of the current sensors.
 
-    No signal of the drive shows it: whatever is measured in amperes has it. The two channels of a three-phase motor
-    are averaged, whose error has a triangular distribution, unless its field stands and one of them sees it all.
+    No signal of the drive shows it, since it affects all measured currents equally. The two channels of a three-phase
+    motor are averaged, so the error has a triangular distribution, unless the field is at rest and one channel carries
+    all the current.
     """
     worst = max(abs(device.stage["adc_gain_error_a"].low), abs(device.stage["adc_gain_error_a"].high))
     if motor.kind == "dc" or not turns:
@@ -34,14 +35,14 @@ def gain_error(device: Device, motor: Motor, *, turns: bool = True) -> float:
 
 
 def interval(value: float, scatter: float, systematic: float, unit: str, absolute: float = 0.0) -> Estimate:
-    """Return an estimate.
+    """Return an estimate whose interval combines three independent errors.
 
     Args:
         value: The value.
-        scatter: Half of the interval that the data's scatter leaves [unit].
-        systematic: Half of what scales with the value, as a share of it.
-        unit: Its unit.
-        absolute: Half of what else no repetition shows [unit].
+        scatter: Half width of the interval by the scatter of the data [unit].
+        systematic: Half width of errors proportional to the value, as a share of it.
+        unit: Unit of the value.
+        absolute: Half width of other errors that repetition does not show [unit].
     """
     half = math.sqrt(scatter**2 + (systematic * value) ** 2 + absolute**2)
     return Estimate(value, value - half, value + half, unit)

@@ -1,4 +1,4 @@
-"""Which axes of a module have no motor: a module may have more axes than motors, and a bus does not show which."""
+"""Detects axes of a module without a motor: a module may have more axes than motors, and a bus cannot read which."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from drive_env import cia402, motion
 from drive_env.drives.interface import Drives, device_of
 from mechanics.arrays import Mask
 
-OPEN_LOAD = "open_load"  # how the names of emergencies begin that tell of a phase without current
-HELD = 0.2  # s at rest with current: a driver tells of an open phase within a quarter of it
+OPEN_LOAD = "open_load"  # first part of the names of emergencies for a phase without current
+HELD = 0.2  # s at rest with current: a driver reports an open phase within a quarter of it
 
 
 def check_motors(drives: Drives) -> None:
-    """Raise RuntimeError, naming them, if axes of a module have no motor; all axes are then disabled, as they were.
+    """Raise RuntimeError, with their numbers, if axes of a module have no motor; all axes are then disabled again.
 
-    A stepper's phases carry current as soon as the axis is enabled, and a driver that finds none tells so (1000h, open
-    load). Nothing is commanded: with its new set-point bit low an axis in pp stands. Where all have motors they stay
-    enabled. Drives in this process are not asked: each of their axes has a motor.
+    A stepper's phases carry current as soon as the axis is enabled, and a driver without current reports an open load
+    (1000h). Nothing moves: an axis in pp stands while its new set-point bit is low. If all axes have motors they stay
+    enabled. Drives in this process are not checked: each of their axes has a motor.
     """
     bus = drives.bus
     if bus is None or drives.num_axes == 1 or not any(n.startswith(OPEN_LOAD) for n in device_of(drives).emergencies):
@@ -27,7 +27,7 @@ def check_motors(drives: Drives) -> None:
     off = ~np.array([cia402.is_live(int(word)) for word in drives.read(cia402.STATUSWORD)])
     modes = drives.read(cia402.MODE)
     drives.emergencies()
-    with suppress(RuntimeError, TimeoutError):  # one that has no motor may be in fault before the last is enabled
+    with suppress(RuntimeError, TimeoutError):  # without a motor it may go into fault before the last is enabled
         motion.enable(drives, mode="pp", where=off)
     drives.advance(HELD)
     without = np.zeros(drives.num_axes, bool)

@@ -1,12 +1,12 @@
-"""Pole pairs, and which way encoder and halls are wired: the field is turned in open loop, and they must follow it.
+"""Checks pole pairs and the wiring of encoder and halls: the field turns in open loop, and the rotor must follow it.
 
-With commutation in open loop (2055h) the current of 2004h points along an angle that the velocity demand turns
-(2102h). The rotor follows: electrical turns of the field over turns that the encoder counts are the pole pairs, and
-the sign says whether it counts in the direction in which the field turns. Commutation by encoder needs both to be
-right before any torque is commanded: a reversed encoder makes a motor run away. So do halls where they commutate.
+With commutation in open loop (2055h) the current of 2004h points along an angle that the velocity demand turns (2102h).
+The rotor follows: electrical turns of the field over turns counted by the encoder give the pole pairs, and the sign
+shows whether the encoder counts in the direction of the field. Commutation by encoder needs both to be correct before
+any torque is commanded: with a reversed encoder the motor runs away. The same holds for halls that commutate.
 
-A brushed motor has no field to turn: a current there and back for some milliseconds, longer and longer until it is
-seen, moves the rotor by some counts and tells the direction before any loop is closed over the encoder.
+A brushed motor has no field to turn: a short current pulse in both directions, lengthened until the encoder counts,
+moves the rotor by a few counts and gives the direction before any loop is closed over the encoder.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ from tuning.identify.working_state import BY_FIELD, Working, enable, read_role, 
 from tuning.oscillation_watch import shaken
 from tuning.stop_causes import stop_causes
 
-# 1/65536 electrical turn
-RAISE, REST, TURN = 20, 60, 240  # cycles: the current comes (gravity does not wait), the rotor rests, the field turns
+# unit of angles: 1/65536 electrical turn
+RAISE, REST, TURN = 20, 60, 240  # cycles: current rises (gravity acts at once), rotor settles, field turns
 MOST_TURN, LEAST_TURN = 1.0, 0.2  # electrical turns of the field
-SHARE = 0.9  # of what current there is
-TOO_SHORT = "travel too short"  # how the reason begins where nothing was turned
-MARGIN = 0.1  # rad of room that stays free
-TOLERANCE = 0.35  # of a pole pair: from here on a ratio is no whole number
-STUCK = 0.25  # of the field's turn: a rotor that follows less does not follow
-# Of a brushed motor: shares of the current and cycles of a quarter of the push; counts that must be seen, and how well
-# they must be the push's own (correlation), apart from what falls or coasts.
+SHARE = 0.9  # of the allowed current
+TOO_SHORT = "travel too short"  # first words of the reason if nothing was turned
+MARGIN = 0.1  # rad of room that is not used
+TOLERANCE = 0.35  # of a pole pair: a larger deviation from a whole number is rejected
+STUCK = 0.25  # of the field's turn: a rotor that moves less does not follow
+# Of a brushed motor: current (as a share) and cycles of a quarter of the pulse; counts that must be seen, and least
+# correlation with the pulse, which an axis that falls or coasts does not reach.
 PUSHES = ((0.5, 4), (0.5, 8), (SHARE, 16), (SHARE, 32), (SHARE, 64))
 LEAST_COUNTS, LIKENESS = 10, 0.7
-PULSED = 1.2  # of the current limit, RMS over 25 ms: beyond, the current loop does not pulse but oscillates
+PULSED = 1.2  # of the current limit, RMS over 25 ms: above, the current loop oscillates
 
 
 class EncoderCheck(NamedTuple):
@@ -48,7 +48,7 @@ class EncoderCheck(NamedTuple):
 
     pole_pairs: Estimate
     direction: Estimate
-    ratio: float = math.nan  # of the field's turns to the encoder's, where the rotor followed
+    ratio: float = math.nan  # of the field's turns to the encoder's; nan if the rotor did not follow
     halls: Halls = Halls()
 
     @property
@@ -57,14 +57,14 @@ class EncoderCheck(NamedTuple):
         return not self.direction.is_known or self.direction.value > 0.0
 
     def is_whole(self, configured: int) -> bool:
-        """Return whether the ratio is a whole number, or so near to the drive's own that it may be that."""
+        """Return whether the ratio is a whole number, or so close to the drive's setting that this may be correct."""
         if self.pole_pairs.is_known or not math.isfinite(self.ratio):
             return True
         return abs(abs(self.ratio) - configured) <= _tolerance(configured)
 
 
 def check_encoders(working: Working) -> list[EncoderCheck]:
-    """Turn the fields of three-phase motors and check the encoders, axis by axis; all axes are off then."""
+    """Turn the fields of three-phase motors and check the encoders, axis by axis; switch all axes off at the end."""
     target, drives = working.target, working.target.drives
     count = target.num_axes
     if target.motor.kind == "dc":
@@ -85,7 +85,7 @@ def check_encoders(working: Working) -> list[EncoderCheck]:
         switch_off(drives, where)
         drives.write(Role.OPEN_LOOP_CURRENT, 0, where=where)
         drives.write(Role.COMMUTATION, commutation, where=where)
-    # Counting up is the field's direction unless 2057h turns the sign of positions around.
+    # The encoder must count up with the field unless 2057h reverses the sign of positions.
     shaft = 1.0 - 2.0 * read_role(target, Role.SHAFT_DIRECTION)
     found = []
     causes = [] if alive.all() else stop_causes(drives)
@@ -105,7 +105,7 @@ def check_encoders(working: Working) -> list[EncoderCheck]:
 
 
 def _push(working: Working) -> list[Estimate]:
-    """Push brushed motors there and back, and return the directions of their encoders; all axes are off then."""
+    """Push brushed motors in both directions and return their encoders' directions; switch all axes off at the end."""
     drives, count = working.target.drives, working.target.num_axes
     found: list[Estimate] = [refused("1", "not asked for")] * count
     waiting = working.where.copy()
@@ -113,7 +113,7 @@ def _push(working: Working) -> list[Estimate]:
         enable(working, "cst", waiting)
         with swinging_allowed(drives), shaken(drives, PULSED * working.current):
             for share, quarter in PUSHES:
-                # As much forth as back, so that the rotor ends at rest and where it was.
+                # The pulse is symmetric, so that the rotor ends at rest and at its old position.
                 sign = np.concatenate([np.repeat((1.0, -1.0, -1.0, 1.0), quarter), np.zeros(quarter)])
                 raw = np.where(waiting, sign[:, None] * to_counts(drives, share * working.current), 0).astype(np.int64)
                 angle = working.angle(
@@ -146,7 +146,7 @@ def _push(working: Working) -> list[Estimate]:
 
 
 def _likeness(angle: Floats, torque: Floats) -> float:
-    """Return the correlation, -1...1, of a motion with that of a free mass under a torque; falling is left out."""
+    """Return the correlation, -1...1, of a motion with that of a free mass under a torque, without parabolic trends."""
     t = np.linspace(-1.0, 1.0, len(angle))
     trend = np.stack([np.ones_like(t), t, t * t], axis=1)
     pair = np.stack([angle, np.cumsum(np.cumsum(torque))], axis=1)
@@ -156,10 +156,10 @@ def _likeness(angle: Floats, torque: Floats) -> float:
 
 
 def able(working: Working) -> tuple[Mask, list[str]]:
-    """Return which axes have the room to swing to the field, to either side, and why the others have not."""
+    """Return which axes have room to turn to the field, to either side, and why the others have not."""
     down, up = working.room()
-    # Switched on, the field pulls the rotor to itself: half an electrical turn at most. Wherever it then stands, the
-    # field can turn it back by as much.
+    # When switched on, the field pulls the rotor by at most half an electrical turn. From any position it can turn the
+    # rotor back by as much.
     needed = np.pi / working.target.motor.n_p + MARGIN
     able = np.minimum(up, -down) >= needed
     reasons = [
@@ -173,11 +173,11 @@ def able(working: Working) -> tuple[Mask, list[str]]:
 
 
 def _way(working: Working) -> tuple[Floats, Mask]:
-    """Return how far the fields turn from where the rotors stand now [electrical rad], and which of them can."""
+    """Return how far the fields turn from the rotors' positions [electrical rad], and which axes have room for it."""
     n_p = working.target.motor.n_p
     down, up = working.room()
     least = LEAST_TURN * 2.0 * np.pi / n_p
-    # All axes of a machine turn the same way where they can: the ends of a beam that turn apart block each other.
+    # If possible all axes of a machine turn in the same direction: the ends of a beam would block each other otherwise.
     free = np.stack([up, -down]).reshape(2, -1, working.target.axes_per_machine).min(axis=2)
     common = np.repeat(np.where(free[0] >= free[1], 1.0, -1.0), working.target.axes_per_machine)
     together = np.repeat(free.max(axis=0) - MARGIN >= least, working.target.axes_per_machine)
@@ -187,10 +187,10 @@ def _way(working: Working) -> tuple[Floats, Mask]:
 
 
 def _turn(working: Working, where: Mask, configured: Floats) -> tuple[Floats, Floats, Floats, list[Halls], list[str]]:
-    """Turn the fields there and back.
+    """Turn the fields in both directions.
 
     Returns:
-        How far the rotors went [rad], there and back, and the fields [rad], what the halls said on the way there, and
+        Turned angles of the rotors [rad], there and back; of the fields [rad]; the halls' result on the way there; and
         why an axis was not turned.
     """
     drives = working.target.drives
@@ -202,7 +202,7 @@ def _turn(working: Working, where: Mask, configured: Floats) -> tuple[Floats, Fl
     stands = [_rest(working)]
     turn, able = _way(working)
     turn = np.where(able, turn, 0.0)
-    # Smooth, so that the rotor does not swing: a raised cosine of speed.
+    # A raised cosine of speed is smooth, so that the rotor does not oscillate.
     shape = 1.0 - np.cos(2.0 * np.pi * (np.arange(TURN) + 0.5) / TURN)
     has_halls = Role.HALL_ANGLE in working.target.device.roles
     seen = [_field_and_halls(working)]
@@ -233,7 +233,7 @@ def _turn(working: Working, where: Mask, configured: Floats) -> tuple[Floats, Fl
 
 
 def stay_inside(working: Working, where: Mask) -> None:
-    """Switch off an axis that left its travel: it slipped from the field, and falls."""
+    """Switch off an axis outside its travel: it lost the field and falls."""
     down, up = working.room()
     out = where & ((up < 0.0) | (down > 0.0))
     if out.any():
@@ -245,19 +245,19 @@ def _angle(working: Working, name: Role) -> Floats:
 
 
 def _field_and_halls(working: Working) -> tuple[Floats, Floats]:
-    """Return the angles of field and halls [electrical rad]; the latter is 0 of a drive that reads none."""
+    """Return the angles of field and halls [electrical rad]; 0 for halls that the drive does not read."""
     halls = read_role(working.target, Role.HALL_ANGLE) * (2.0 * np.pi / 65536.0)
     return _angle(working, Role.FIELD_ANGLE), np.asarray(halls)
 
 
 def _rest(working: Working) -> Floats:
-    """Return where the rotors come to rest [rad]."""
+    """Return the angles at which the rotors come to rest [rad]."""
     trace = working.target.drives.record([cia402.POSITION_ACTUAL], 2 * REST * CYCLE)
     return np.asarray(working.angle(trace[cia402.POSITION_ACTUAL])[REST:].mean(axis=0))
 
 
 def _judge(field: float, away: float, back: float, expected: int) -> EncoderCheck:
-    """Judge an encoder by a turn of the field [electrical rad] and the rotor's ways there and back [rad]."""
+    """Judge an encoder by the turn of the field [electrical rad] and the rotor's angles there and back [rad]."""
     rotor = 0.5 * (away - back)
     would = field / expected
     if abs(rotor) < STUCK * abs(would) or abs(away + back) > 0.5 * abs(away - back):
@@ -268,7 +268,7 @@ def _judge(field: float, away: float, back: float, expected: int) -> EncoderChec
         return EncoderCheck(refused("1", reason), refused("1", reason))
     ratio = field / rotor
     direction = Estimate(float(np.sign(ratio)), float(np.sign(ratio)), float(np.sign(ratio)), "1")
-    # Where the rotor rests depends on friction: by half of what it went differently there and back.
+    # Friction changes the rotor's position of rest: the error is half the difference between there and back.
     spread = abs(away + back) / 2.0 / abs(rotor) * abs(ratio)
     nearest = round(abs(ratio))
     if nearest < 1 or abs(abs(ratio) - nearest) + spread > _tolerance(nearest):

@@ -1,4 +1,4 @@
-"""The order of the experiments of an identification: each needs the results of those before it."""
+"""Runs the experiments of an identification in order: each needs the results of earlier ones."""
 
 from __future__ import annotations
 
@@ -49,14 +49,14 @@ if TYPE_CHECKING:
     from tuning.response.plant_fit import PlantFit
 
 
-HOLD, STEADY = 160, 80  # cycles at rest before anything moves, and how many of them count
-FREQUENCY_CURRENT_HZ, FREQUENCY_VELOCITY_HZ = 800.0, 25.0  # of the loops in which the response is measured
-# Of the rate of the current loop, the fastest one there: 45 degrees of phase are left, and a quarter less inductance
-# than expected leaves 30.
+HOLD, STEADY = 160, 80  # cycles at rest before anything moves, and the last of them that are averaged
+FREQUENCY_CURRENT_HZ, FREQUENCY_VELOCITY_HZ = 800.0, 25.0  # bandwidths of the loops in which the response is measured
+# Greatest bandwidth of that current loop over its rate: it leaves a phase margin of 45 degrees, or of 30 if the
+# inductance is a quarter less than expected.
 FASTEST_CURRENT = 1.0 / 12.0
 LEAST_ROOM = 1.2  # rad
 HIGHEST = 400.0  # Hz, of the response
-WORST_MISFIT = 2.0  # of the linear model, over what noise explains
+WORST_MISFIT = 2.0  # greatest error of the linear model, over that explained by noise
 UNITS = {
     "resistance": "ohm", "inductance": "H", "pole_pairs": "1", "encoder_direction": "1", "inertia": "kg*m^2",
     "coulomb": "A", "viscous": "A*s/rad", "offset": "A", "anti_resonance": "Hz", "resonance": "Hz",
@@ -64,25 +64,25 @@ UNITS = {
 }  # fmt: skip
 MECHANICS, RESPONSE = NAMES[NAMES.index("inertia") :], NAMES[NAMES.index("anti_resonance") :]
 SAYS_NOTHING = "so the check of pole pairs and encoder says nothing, and torque is not commanded"
-OSCILLATED = "the axis oscillated"  # how the reason begins where one did
+OSCILLATED = "the axis oscillated"  # first words of the reason if an axis oscillated
 
 
 class Experiments:
-    """One identification of some axes, side by side; `quick_identification` replaces those that need torque.
+    """One identification of some axes at the same time; `quick_identification` overrides the steps that need torque.
 
     Attributes:
-        target, where, progress: As `tuning.identify.identification.identify` takes them.
-        found: What is known so far of each axis, by the names of `NAMES`.
+        target, where, progress: As in `tuning.identify.identification.identify`.
+        found: Present results of each axis, by the names of `NAMES`.
     """
 
-    thorough = True  # also experiments that only narrow an interval
-    corrects = False  # drives that a user has set up keep the settings of their wiring, too
+    thorough = True  # include experiments that only narrow an interval
+    corrects = False  # wiring settings also of drives that are already commissioned
 
     def __init__(self, target: Target, where: Mask, progress: Progress) -> None:
-        check_linear_model(target.device)  # what is moved with here comes from it
+        check_linear_model(target.device)  # it determines the gains of the experiments
         self.target, self.where, self.progress = target, where, progress
         self._drives = target.drives
-        self._at_rest: list[Estimate] = []  # resistances, where they are looked for
+        self._at_rest: list[Estimate] = []  # resistances at rest, if they are measured
         self._under_way: tuple[str, tuple[str, ...]] = ("", NAMES)
         self.found: list[dict[str, Estimate]] = [
             {name: refused(UNITS[name], "not asked for") for name in NAMES} for _ in range(target.num_axes)
@@ -91,7 +91,7 @@ class Experiments:
         self._fits: list[PlantFit | None] = [None] * target.num_axes
 
     def run(self) -> list[Identification]:
-        """Do them all."""
+        """Run all experiments and return the results."""
         with timed(self.target) as (target, clock):
             noise = target.device.stage["adc_noise"].high
             self._drives = target.drives
@@ -110,12 +110,12 @@ class Experiments:
                 for found, chosen, wiring, fit in every]  # fmt: skip
 
     def begin(self, what: str, share: float, names: tuple[str, ...]) -> None:
-        """Report the experiment under way and the share done; it and all after it give the values of these names."""
+        """Report the present experiment and the share done; it and later ones give the values of these names."""
         self.progress(what, share)
         self._under_way = what, names
 
     def calm(self, working: Working) -> Working:
-        """Return the axes that did not oscillate; missing values of the others are refused with that reason."""
+        """Return the axes that did not oscillate; refuse missing values of the others with that reason."""
         watch = watch_of(working.target.drives)
         swung = working.where & (np.zeros_like(working.where) if watch is None else watch.swung)
         what, names = self._under_way
@@ -131,7 +131,7 @@ class Experiments:
         return replace(working, where=working.where & ~swung)
 
     def check(self, working: Working) -> Mask:
-        """Check the encoders and return the axes whose torque may be commanded."""
+        """Check the encoders and return the axes that may get torque."""
         self.begin("pole pairs and encoder", 0.0, NAMES)
         checks = self._corrected(working, check_encoders(working))
         good = working.where.copy()
@@ -140,7 +140,7 @@ class Experiments:
             self.found[k] |= {"pole_pairs": check.pole_pairs, "encoder_direction": check.direction}
             reason = self._wrong(working, int(k), check)
             if reason and is_distorted(self._drives):
-                # It turned the field by more than was asked for: what it blames, wiring or motor, may be right.
+                # Late SYNCs turned the field too far: the wiring or motor that the check blames may be correct.
                 reason = f"{told_lateness(self._drives)}; {SAYS_NOTHING}"
                 self.found[k] |= {name: refused("1", reason) for name in ("pole_pairs", "encoder_direction")}
                 self._wiring[k] = {}
@@ -152,7 +152,7 @@ class Experiments:
         return good
 
     def _corrected(self, working: Working, checks: list[EncoderCheck]) -> list[EncoderCheck]:
-        """Set drives up for the wiring that was seen, where they may be, and look again; it is taken back."""
+        """Set the drives up for the measured wiring where allowed, and check again; the settings are restored later."""
         has = {key: working.target.drives.read(key) for key in findings(working.target.device)}
         again = np.zeros(len(checks), bool)
         for k in map(int, np.flatnonzero(working.where)):
@@ -160,7 +160,7 @@ class Experiments:
             self._wiring[k] = needed(working.target.device, own, checks[k].direction.value, checks[k].halls)
             again[k] = bool(changes(self._wiring[k])) and (self.corrects or working.fresh[k])
         again &= not is_distorted(self._drives)
-        # What its halls aligned when it was first enabled stays so until it is switched off.
+        # An encoder aligned by halls when it was first enabled keeps this alignment until it is switched off.
         again &= ~_aligned_by_halls(working)
         if not again.any():
             return checks
@@ -169,11 +169,11 @@ class Experiments:
         second = check_encoders(replace(working, where=again))
         for k in map(int, np.flatnonzero(again)):
             if not second[k].is_good:
-                self._wiring[k] = {}  # it does not do what the drive was told
+                self._wiring[k] = {}  # the setting did not have the expected effect
         return [new if chosen else old for old, new, chosen in zip(checks, second, again, strict=True)]
 
     def _wrong(self, working: Working, k: int, check: EncoderCheck) -> str:
-        """Return why no torque may be commanded, if so."""
+        """Return why an axis must not get torque; "" if it may."""
         target = working.target
         aligned = bool(_aligned_by_halls(working)[k])
         by_halls = aligned or target.drives.read(Role.COMMUTATION)[k] == BY_HALLS
@@ -212,7 +212,7 @@ class Experiments:
         return ""
 
     def turn(self, working: Working) -> None:
-        """Make the experiments that need torque."""
+        """Run the experiments that need torque."""
         working, holding = self.pulse_currents(working)
         drives = working.target.drives
         self.begin("inertia and friction", 0.3, MECHANICS)
@@ -228,7 +228,7 @@ class Experiments:
             go_back(replace(working, where=on), "csv", to=0.0)
 
     def pulse_currents(self, working: Working) -> tuple[Working, Floats]:
-        """Identify the windings; return the axes that did not oscillate, in csv, and what holds each [A]."""
+        """Identify the windings; return the axes that did not oscillate, in csv, and their holding currents [A]."""
         target, drives = working.target, working.target.drives
         self.begin("current pulses", 0.15, NAMES)
         enable(working, "csp")
@@ -260,10 +260,10 @@ class Experiments:
         return np.asarray(trace[cia402.TORQUE_ACTUAL][-STEADY:].mean(axis=0) * ampere_per_count(drives))
 
     def take_windings(self, working: Working, windings: list[Winding]) -> None:
-        """Take resistance and inductance."""
+        """Store the estimates of resistance and inductance."""
         for k in np.flatnonzero(working.where):
             both = [windings[k].resistance, *self._at_rest[k : k + 1]]
-            # In real time pulses say nothing, and why not is not what helps.
+            # In real time the pulses give no resistance; then the reason of the other method is the useful one.
             resistance = min(
                 (one for one in both if one.is_known), key=lambda one: one.high - one.low,
                 default=both[-1] if _in_real_time(working) else both[0],
@@ -271,9 +271,9 @@ class Experiments:
             self.found[k] |= {"resistance": resistance, "inductance": windings[k].inductance}
 
     def respond(self, working: Working, inertia: Floats) -> None:
-        """Measure the velocity loop's response, with loops fit for it, and take its estimates."""
+        """Measure the velocity loop's response with suitable gains, and store its estimates."""
         target, drives = working.target, working.target.drives
-        # Still enabled: an axis under gravity would fall between the experiments.
+        # Still enabled: a loaded axis would fall between the experiments otherwise.
         go_back(working, "csv")
         able = working.where & still_enabled(working, drives.read(cia402.STATUSWORD))
         down, up = working.room()
@@ -332,7 +332,7 @@ class Experiments:
         return np.array(rows, np.int64)
 
     def refuse(self, k: int, names: tuple[str, ...], reason: str) -> None:
-        """Refuse values that are still missing, by a reason or by late SYNCs."""
+        """Refuse values that are still missing, with a reason, late SYNCs first."""
         reason = late_first(self._drives, reason)
         for name in names:
             if not self.found[k][name].is_known and self.found[k][name].reason in ("", "not asked for"):
@@ -342,9 +342,9 @@ class Experiments:
 def current_bandwidth(target: Target, k: int) -> float:
     """Return the bandwidth of the current loop [Hz] in which the response of an axis is measured.
 
-    Dead time looks like resistance to a current near zero, on mains many times the winding's, and to none where it is
-    large. A loop that is slower than that resistance over the inductance answers differently to each strength and
-    direction of the excitation, as backlash does.
+    To a current near zero, dead time looks like a resistance, at mains voltage many times the winding's; to a large
+    current it does not. A current loop slower than this resistance over the inductance responds differently to each
+    amplitude and direction of the excitation, as backlash does.
     """
     device, motor = target.device, target.motor
     lost = dead_time_resistance(device, motor, float(target.supply[k]), np.zeros(1))
@@ -353,7 +353,7 @@ def current_bandwidth(target: Target, k: int) -> float:
 
 
 def _aligned_by_halls(working: Working) -> Mask:
-    """Return which drives commutate by an encoder that the halls align."""
+    """Return which drives commutate by an encoder that was aligned by halls."""
     drives = working.target.drives
     by_encoder = drives.read(Role.COMMUTATION) == BY_ENCODER
     return np.asarray(by_encoder & (read_role(working.target, Role.ENCODER_INITIALISATION) == ALIGNED_BY_HALLS))

@@ -1,7 +1,7 @@
-"""Parameters of motor and machine from a drive's own signals, each with a 95 % interval or a reason.
+"""Identifies parameters of motor and machine from a drive's own signals, each with a 95 % interval or a reason.
 
-`identify` runs the experiments in the order in which each needs what came before, for all axes side by side, and
-leaves every drive as it was found: off, with its own parameters.
+`identify` runs the experiments in an order in which each has the results that it needs, on all axes at the same time,
+and restores every drive: off, with its own parameters.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ if TYPE_CHECKING:
 
 
 def identify(target: Target, where: Mask | None = None, *, progress: Progress | None = None) -> list[Identification]:
-    """Identify axes, and leave the drives off and with the parameters that they had, also after an error.
+    """Identify axes; leave the drives off and with their former parameters, also after an error.
 
     Args:
-        target: The axes, with what is known of them. They must be off, and at rest.
-        where: Which of them; all by default. The others have no values.
-        progress: Called with the present step and the share done.
+        target: The axes. They must be off and at rest.
+        where: Axes to identify; all by default. The others get no values.
+        progress: Called with the present step and the share that is done.
 
     Returns:
-        One per axis; a value that could not be identified has the reason instead.
+        One identification per axis; a value that could not be identified has the reason instead.
 
     Raises:
-        RuntimeError: If an axis is enabled, or does not come up; ValueError if no axis is chosen.
+        RuntimeError: If an axis is enabled, or cannot be enabled; ValueError if no axis is chosen.
     """
     axes = np.ones(target.num_axes, bool) if where is None else np.asarray(where, bool)
     if axes.shape != (target.num_axes,) or not axes.any():

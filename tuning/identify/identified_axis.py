@@ -13,15 +13,15 @@ if TYPE_CHECKING:
     from tuning.identify.wiring import Settings
     from tuning.response.plant_fit import PlantFit
 
-Progress = Callable[[str, float], None]  # the present step, and the share done, 0...1
+Progress = Callable[[str, float], None]  # the present step, and the share that is done, 0...1
 
-# In the order in which they are identified and shown.
+# In the order of identification and display.
 NAMES = (
     "resistance", "inductance", "pole_pairs", "encoder_direction", "inertia", "coulomb", "viscous", "offset",
     "anti_resonance", "resonance", "loop_delay", "velocity_filter",
 )  # fmt: skip
 
-TITLES = {  # as people read them
+TITLES = {  # for users
     "resistance": "phase resistance",
     "inductance": "phase inductance",
     "pole_pairs": "pole pairs",
@@ -44,18 +44,18 @@ class Identification:
     """The identification of one axis.
 
     Attributes:
-        estimates: By name, those of `NAMES`: "resistance" [ohm per phase], "inductance" [H per phase, of the q axis],
-            "pole_pairs", "encoder_direction" (1 as it should be, -1 reversed), "inertia" (J/K_t times the data sheet's
-            K_t, all that turns, at the rotor [kg*m^2]), "coulomb" [A], "viscous" [A*s/rad], "offset" [A, gravity or a
+        estimates: By the names of `NAMES`: "resistance" [ohm per phase], "inductance" [H per phase, q axis],
+            "pole_pairs", "encoder_direction" (1 correct, -1 reversed), "inertia" (J/K_t times the data sheet's K_t,
+            everything that turns, at the rotor [kg*m^2]), "coulomb" [A], "viscous" [A*s/rad], "offset" [A, gravity or a
             constant load], "anti_resonance", "resonance" [Hz], "loop_delay" [s], "velocity_filter" [Hz].
         drive_time: Time that passed on the drive [s].
-        told: The identified values without guesses, where `estimates` have guesses for a tuner; None where they have
-            none.
-        wiring: The settings that encoder and halls need, by object, and those of the drive. With wrong ones the motor
-            runs away or locks.
-        fit: The linear model fitted to the frequency response, None where none was measured or it is another axis's.
-        pushed: What the axis pushes for each axis of its machine that accelerates, its row of their mass matrix at the
-            rotors, as "inertia" [kg*m^2]; () where it was not measured.
+        told: Identified values only, if `estimates` also has assumed values for a tuner; None if it has none.
+        wiring: For each wiring object, the value that encoder and halls need, and the drive's. With wrong ones the
+            motor runs away or locks.
+        fit: The linear model fitted to the frequency response; None if none was measured, or it is that of another
+            axis.
+        pushed: This axis' row of the mass matrix of its machine at the rotors, as "inertia" [kg*m^2]; () if not
+            measured.
     """
 
     estimates: Mapping[str, Estimate]
@@ -67,9 +67,9 @@ class Identification:
 
     @property
     def together(self) -> float:
-        """Total inertia that the axis pushes while all axes of its machine accelerate alike; nan if not measured."""
+        """Total inertia that the axis moves if all axes of its machine accelerate equally; nan if not measured."""
         return sum(self.pushed) if self.pushed else math.nan
 
     def value(self, name: str) -> float:
-        """Return a value, nan where it was not identified."""
+        """Return a value; nan if it was not identified."""
         return self.estimates[name].value

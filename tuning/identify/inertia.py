@@ -1,13 +1,13 @@
 """Inertia, dry and viscous friction and constant load, all over K_t, from the momentum balance of moves there and back.
 
-Between two moments the charge that flowed is what the speed gained, and what friction and load took:
+Between two times, the charge that flowed equals the change of speed plus what friction and load took:
 
     integral of i = J/K_t (omega_2 - omega_1) + c integral of sign(omega) + v (theta_2 - theta_1) + o (t_2 - t_1)
 
-Every equation is weighted by a smooth window, over a cruise or from the middle of one to the middle of the next, the
-other way; an elastic load's swinging averages out in them. From one speed to its opposite, what a transmission loses in
-proportion to what it carries cancels in part, half of the time it helps the motor to brake; where it is clear, the rest
-is taken out (`transmission_loss.py`).
+Each equation is weighted by a smooth window, over a cruise or from the middle of one to the middle of the next in the
+other direction; the oscillation of an elastic load averages out. Losses of a transmission proportional to its load
+cancel in part, since half of the time they help to brake; if they are significant, the rest is estimated
+(`transmission_loss.py`).
 """
 
 from __future__ import annotations
@@ -41,29 +41,30 @@ from tuning.target import Target
 
 MOST_RATIO = 30.0  # over the rotor's: beyond, a cautious excitation hardly moves the load (Yaskawa: 15 to 30)
 SPEED_SHARE, CURRENT_SHARE, ROOM_SHARE = 0.7, 0.5, 0.75  # of the limits
-SLOWER = 0.9  # by which moves are made slower in turn that would overcharge the DC link
-SHARES = (1.0, 0.65, 0.35)  # of the greatest speed, in turn
-COARSE, FINE = (1, (0.6, 0.3)), (2, SHARES)  # how often, at which shares of the greatest speed
-RAMP, CRUISE = (30, 250), (60, 140)  # cycles, shortest and longest
-CORRECTION, FOLLOW = 10, 5.0  # cycles between corrections of the way; 1/s
-STILL = 40  # cycles at rest in the beginning
-NUDGE = 1.0  # rad, of a move alone
-LINKED_CURRENT, LINKED_WAY = 0.08, 0.15  # of current and move: from here on another axis is pulled along
-LEAST_COUNTS = 40.0  # that a cruise must pass
-WIDEST, WIDEST_FRICTION = 0.25, 0.2  # half of an interval over its value: what is wider is no identification
+SLOWER = 0.9  # factor by which the speed of moves that would overcharge the DC link is reduced repeatedly
+SHARES = (1.0, 0.65, 0.35)  # of the greatest speed, in this order
+COARSE, FINE = (1, (0.6, 0.3)), (2, SHARES)  # number of repetitions, and shares of the greatest speed
+RAMP, CRUISE = (30, 250), (60, 140)  # cycles, least and greatest number
+CORRECTION, FOLLOW = 10, 5.0  # cycles between corrections of the position; gain of the correction [1/s]
+STILL = 40  # cycles at rest at the beginning
+NUDGE = 1.0  # rad, of a move of one axis alone
+LINKED_CURRENT, LINKED_WAY = 0.08, 0.15  # of current and move: greater values mean that another axis is pulled along
+LEAST_COUNTS = 40.0  # counts that a cruise must pass
+WIDEST, WIDEST_FRICTION = 0.25, 0.2  # greatest half width of an interval over its value
 SLOPE, DRAG = 4, 5  # columns of the balance
-FEWEST_MOVES = 5  # with which more than the four is looked for
-CLEAR = 4.0  # times its deviation: from here on an effect that most loads do not have is one
-# Times what cogging and the sensors' offsets can make of it, at least, where a load changes with position: both repeat
-# from move to move, so that no deviation shows them, and on a short way they look like a slope.
+FEWEST_MOVES = 5  # least number of moves to fit more than four terms
+CLEAR = 4.0  # times its standard deviation: least size of an effect that most loads do not have
+# Least slope of a position-dependent load over that which cogging and sensor offsets can cause: both repeat in each
+# move, so that no standard deviation shows them, and look like a slope on a short way.
 OVER_RIPPLE = 3.0
-# Of what is over K_t, 95 %: commutation, temperature, the ripple that samples hide, a transmission's losses.
+# Relative error of all values over K_t, 95 %: commutation, temperature, ripple between samples, losses of a
+# transmission.
 TORQUE_MODEL = 0.018
-VISCOUS_MODEL = 0.02  # the same, of viscous friction besides: a transmission loses some of what lies behind it
+VISCOUS_MODEL = 0.02  # additional one of viscous friction: a transmission loses part of the friction behind it
 
 
 class Mechanics(NamedTuple):
-    """The mechanics of one axis by its moves, in data sheet units: J/K_t times the data sheet's K_t."""
+    """The mechanics of one axis from its moves, in data sheet units: J/K_t times the data sheet's K_t."""
 
     inertia: Estimate
     coulomb: Estimate
@@ -72,9 +73,9 @@ class Mechanics(NamedTuple):
 
 
 class Rough(NamedTuple):
-    """Rough mechanics of one axis, for its next moves.
+    """Rough mechanics of one axis to plan its next moves.
 
-    Inertia [kg*m^2], current that holds the axis [A], and what dry friction takes of it in motion at least [A].
+    Inertia [kg*m^2], current that holds the axis [A], and least current of dry friction in motion [A].
     """
 
     inertia: float
@@ -84,26 +85,26 @@ class Rough(NamedTuple):
 
 @dataclass(frozen=True)
 class Plan:
-    """Moves of every axis: set-points of speed [rad/s], shape (rows, num_axes), and the cruises of each."""
+    """The moves of every axis: set-points of speed [rad/s], shape (rows, num_axes), and the cruises of each."""
 
     speed: Floats
-    cruises: tuple[tuple[tuple[int, int, int], ...], ...]  # first and last row, and which move, for every axis
+    cruises: tuple[tuple[tuple[int, int, int], ...], ...]  # first and last row, and number of the move, for every axis
 
 
 def plan_moves(
     working: Working, inertia: Floats, holding: Floats, friction: Floats, times: int, shares: tuple[float, ...],
     linked: bool = False,
 ) -> Plan:  # fmt: skip
-    """Return moves that stay inside the axes' travel, speed and current, and do not overcharge the DC link.
+    """Plan moves within the axes' travel, speed and current that do not overcharge the DC link.
 
     Args:
         working: The drives.
-        inertia: Total inertia as far as it is known [kg*m^2], shape (num_axes,).
+        inertia: Total inertia as far as known [kg*m^2], shape (num_axes,).
         holding: Current that holds the axis [A], shape (num_axes,).
-        friction: Current that dry friction takes at least [A], shape (num_axes,).
-        times: How often each speed comes.
+        friction: Least current of dry friction [A], shape (num_axes,).
+        times: Number of repetitions of each speed.
         shares: Speeds over the greatest.
-        linked: Whether the axes of a machine move as one: by what all of them can.
+        linked: Whether the axes of a machine move as one, within the limits of all.
     """
     target = working.target
     down, up = working.room()
@@ -136,18 +137,18 @@ def _moves(
     down: float, up: float, acceleration: float, limit: float, times: int, shares: tuple[float, ...],
     fits: Callable[[Floats], bool],
 ) -> tuple[Floats, tuple[tuple[int, int, int], ...]]:  # fmt: skip
-    """Return one axis' set-points of speed [rad/s] and its cruises.
+    """Plan one axis' set-points of speed [rad/s] and its cruises.
 
     Args:
-        down: How far it may turn backwards [rad], 0 or less.
-        up: How far forwards.
-        acceleration: The steepest [rad/s^2].
-        limit: Of its speed [rad/s].
-        times: How often each speed comes.
+        down: Signed angle that it may turn backwards [rad], at most 0.
+        up: Signed angle that it may turn forwards [rad].
+        acceleration: Greatest acceleration [rad/s^2].
+        limit: Greatest speed [rad/s].
+        times: Number of repetitions of each speed.
         shares: Speeds over the greatest.
-        fits: Whether the DC link bears a move.
+        fits: Whether a move does not overcharge the DC link.
     """
-    # To one side first where there is little room, and then over the whole of it.
+    # If there is little room, first move to one side, then use the whole room.
     sign = 1.0 if up >= -down else -1.0
     longer, shorter = ROOM_SHARE * max(up, -down), ROOM_SHARE * min(up, -down)
     longest, speed = _fastest(acceleration, longer, limit)
@@ -166,7 +167,7 @@ def _moves(
     for share in shares:
         w = share * speed
         ramp = _ramp(w, acceleration)
-        # A weight feeds back as long as it goes down: better a short cruise at a high speed, and more of them.
+        # A weight feeds back energy while it goes down: prefer short cruises at a high speed, and more of them.
         cruise = longest
         while cruise > CRUISE[0] and not fits(_there_and_back(w, ramp, cruise)):
             cruise -= 10
@@ -182,7 +183,7 @@ def _moves(
 
 
 def _there_and_back(speed: float, ramp: int, cruise: int) -> Floats:
-    """Return a move as speeds [rad/s]: up in so many cycles of ramp, a cruise, the same back."""
+    """Return a move as speeds [rad/s]: a ramp of so many cycles, a cruise, and the same back."""
     rise, level = _rise(ramp), np.ones(cruise)
     return speed * np.concatenate([rise, level, 1.0 - 2.0 * _rise(2 * ramp), -level, rise - 1.0])
 
@@ -194,12 +195,12 @@ def _of_machines(target: Target, values: Floats, choose: Callable[..., Floats]) 
 
 
 def _rise(cycles: int) -> Floats:
-    """Return a smooth way from 0 to 1: its edges do not shake an elastic load."""
+    """Return a smooth step from 0 to 1: its edges do not excite an elastic load."""
     return np.asarray(0.5 - 0.5 * np.cos(np.pi * (np.arange(cycles) + 1.0) / cycles))
 
 
 def _bump(way: float) -> Floats:
-    """Return a slow move by a way [rad] as speeds."""
+    """Return a slow move by an angle [rad] as speeds."""
     if way == 0.0:
         return np.zeros(0)
     cycles = 2 * RAMP[1]
@@ -208,12 +209,12 @@ def _bump(way: float) -> Floats:
 
 
 def _ramp(speed: float, acceleration: float) -> int:
-    """Return how many cycles a smooth ramp takes: in its middle it is pi/2 times as steep as on the whole."""
+    """Return the number of cycles of a smooth ramp; its steepest slope is pi/2 times its mean slope."""
     return int(np.clip(np.ceil(0.5 * np.pi * abs(speed) / acceleration / CYCLE), *RAMP))
 
 
 def _fastest(acceleration: float, way: float, limit: float) -> tuple[int, float]:
-    """Return for how long to cruise [cycles], and how fast [rad/s]: a way is half a ramp, a cruise, half a ramp."""
+    """Return duration [cycles] and speed [rad/s] of a cruise; a way is half a ramp, a cruise and half a ramp."""
     cruise, w = CRUISE[1], 0.0
     steepness = acceleration / (0.5 * np.pi)
     most = min(steepness * RAMP[1] * CYCLE, limit)
@@ -228,9 +229,9 @@ def _fastest(acceleration: float, way: float, limit: float) -> tuple[int, float]
 
 
 def move(working: Working, plan: Plan) -> tuple[Floats, Floats, Mask]:
-    """Make the moves in csv; return angles [rad] and currents [A], (rows, num_axes), and which axes went through."""
+    """Make the moves in csv; return angles [rad], currents [A], (rows, num_axes), and axes that were not stopped."""
     drives = working.target.drives
-    # The velocity loop alone would drift by what every reversal of friction leaves: the way is looked after, slowly.
+    # Friction makes the velocity loop drift with every reversal: the position is corrected slowly.
     begin = working.angle(drives.read(cia402.POSITION_ACTUAL))
     way = begin + np.cumsum(plan.speed, axis=0) * CYCLE
     fastest = np.abs(plan.speed).max(axis=0)
@@ -252,10 +253,10 @@ def move(working: Working, plan: Plan) -> tuple[Floats, Floats, Mask]:
 
 
 def identify_mechanics(working: Working, holding: Floats) -> tuple[list[Mechanics], Floats]:
-    """Move the axes, which are enabled in csv at rest; return the mechanics of each, and total inertias [kg*m^2].
+    """Move the axes, enabled in csv at rest; return the mechanics of each, and total inertias [kg*m^2].
 
-    Machines move side by side. The axes of one move one after the other while the others hold, unless they pull at the
-    same thing: then they move together, and each inertia is what its drive has to move.
+    Machines move at the same time. The axes of one move one after the other while the others hold, unless they are
+    linked: then they move together, and each inertia is the share that its drive moves.
     """
     target = working.target
     count = target.num_axes
@@ -274,7 +275,7 @@ def identify_mechanics(working: Working, holding: Floats) -> tuple[list[Mechanic
 
 
 def are_linked(working: Working) -> bool:
-    """Return whether the axes of a machine pull at the same thing: one that moves alone is resisted by the others."""
+    """Return whether the axes of a machine are linked: one that moves alone is resisted by the others."""
     target, drives = working.target, working.target.drives
     first = working.where & (np.arange(target.num_axes) % target.axes_per_machine == 0)
     down, up = working.room()
@@ -296,7 +297,7 @@ def are_linked(working: Working) -> bool:
 
 
 def _identify_moving(working: Working, holding: Floats, inertia: Floats, linked: bool) -> list[Mechanics]:
-    """Move the axes and return the mechanics of each; `inertia` is brought up to date."""
+    """Move the axes and return the mechanics of each; `inertia` is updated in place."""
     target = working.target
     results: list[Mechanics] = []
     softness = np.ones(target.num_axes, np.int64)
@@ -316,7 +317,7 @@ def _identify_moving(working: Working, holding: Floats, inertia: Floats, linked:
                 continue
             found, rough = _balance(working, k, angle[:, k], current[:, k], moves, gains[k])
             results.append(found)
-            # At rest dry friction holds what it likes up to its own; in motion it is known what it takes.
+            # At rest dry friction can hold any part of the load up to its own value; in motion its part is known.
             holding[k], friction[k] = rough.holding, rough.friction
             inertia[k] = np.clip(rough.inertia, 0.7 * target.motor.inertia, 2.0 * MOST_RATIO * target.motor.inertia)
     return results
@@ -325,7 +326,7 @@ def _identify_moving(working: Working, holding: Floats, inertia: Floats, linked:
 def _moved(
     working: Working, plan: Callable[[], Plan], gains: Integers, softness: Integers
 ) -> tuple[Plan, Floats, Floats, Mask, Integers]:
-    """Move, once more with softer gains if an axis oscillates; return plan, the result of `move`, and the gains."""
+    """Move, again with softer gains if an axis oscillates; return plan, the result of `move`, and the gains."""
     drives = working.target.drives
     watch = watch_of(drives)
     gains = working.target.device.gains.softened(gains, softness, "velocity")
@@ -351,10 +352,10 @@ def _none(reason: str) -> Mechanics:
 
 
 def hidden_ripple(target: Target, k: int, gains: Integers, inertia: float) -> float:
-    """Return the mean current of an accelerating axis over that of its samples.
+    """Return the mean current of an accelerating axis over the mean of its samples.
 
-    The velocity demand steps once a millisecond, and the current with it; every sample comes at the same moment of
-    that ripple, at its lowest. The velocity loop's windows, one millisecond after the other, say by how much.
+    The velocity demand steps once per millisecond, and the current follows; every sample is taken at the same phase of
+    this ripple, at its minimum. A simulation of the velocity loop's windows gives the ratio.
     """
     device, motor = target.device, target.motor
     supply = float(target.supply[k])
@@ -443,16 +444,16 @@ def _with_losses(
     did: Motion, cruises: tuple[tuple[int, int, int], ...], motor: Motor, rows: BalanceRows, fit: Solved, least: float,
     hidden: float,
 ) -> tuple[float, Solved, Floats]:  # fmt: skip
-    """Return inertia [kg*m^2], the fit, and half of the remaining range of its unknowns, with a transmission's losses.
+    """Return inertia [kg*m^2], fit, and half width of its unknowns' remaining range, with a transmission's losses.
 
     Args:
-        did: What the axis did.
-        cruises: First and last sample of every cruise, and its move.
+        did: Motion of the axis.
+        cruises: First and last sample of every cruise, and the number of its move.
         motor: Its motor.
         rows: The balance.
-        fit: What it says without losses.
-        least: As `_fit` takes it.
-        hidden: As `hidden_ripple` returns it.
+        fit: Its solution without losses.
+        least: As in `_fit`.
+        hidden: Result of `hidden_ripple`.
     """
     K = motor.torque_constant
     losses = find_losses(did, cruises, motor, fit.mean[1:3]) if len(np.unique(rows.moves)) >= FEWEST_MOVES else ()
@@ -477,9 +478,9 @@ def _with_losses(
 
 
 def _periodic(working: Working, k: int, inertia: float, plan: Plan) -> float:
-    """Return the inertia's error by cogging and the sensors' offsets, 95 %, as a share of it.
+    """Return the inertia's relative error by cogging and sensor offsets, 95 %.
 
-    Both repeat with the angle: over many turns they average out, over a short way every move has the same of them.
+    Both repeat with the angle: over many turns they average out, on a short way they are the same in each move.
     """
     motor = working.target.motor
     way = np.cumsum(plan.speed[:, k]) * CYCLE
@@ -491,10 +492,10 @@ def _periodic(working: Working, k: int, inertia: float, plan: Plan) -> float:
 
 
 def _ripple(target: Target) -> float:
-    """Return the current that repeats with the angle, by cogging and the sensors' offsets, as RMS [A]."""
+    """Return the RMS current of cogging and sensor offsets, which repeat with the angle [A]."""
     motor = target.motor
     offsets = [target.device.stage[name] for name in ("adc_offset_a", "adc_offset_b")]
-    # Uniform between their limits; a cosine of the angle.
+    # Uniform between their limits; each acts as a cosine of the angle.
     sensors = np.hypot(*((row.high - row.low) / 12.0**0.5 for row in offsets)) / 2.0**0.5
     return float(np.hypot(motor.cogging_torque / motor.torque_constant, sensors) / 2.0**0.5)
 
@@ -509,15 +510,15 @@ def _friction(value: float, half: float, scale: float, unit: str, why: str) -> E
 
 
 def _weights(samples: int, cruises: tuple[tuple[int, int, int], ...]) -> tuple[list[Floats], list[int]]:
-    """Return smooth weights, shape (samples,) each, and their moves.
+    """Return smooth weights, shape (samples,) each, and the numbers of their moves.
 
-    One over every cruise, one over every change between two cruises, which add up to 1. Smooth edges let an elastic
-    load's swinging average out, which sharp ones do not.
+    One for every cruise, one for every change between two cruises; together they add up to 1. Smooth edges let the
+    oscillation of an elastic load average out; sharp ones do not.
     """
     t = np.arange(samples, dtype=float)
     weights, moves = [], []
     for j, (first, last, number) in enumerate(cruises):
-        begin = first + (last - first) // 5  # the loop swings in
+        begin = first + (last - first) // 5  # the loop is settling before
         centre = 0.5 * (begin + last)
         weights.append(np.minimum(step(t, begin, centre), 1.0 - step(t, centre, last)))
         moves.append(number)
@@ -530,14 +531,14 @@ def _weights(samples: int, cruises: tuple[tuple[int, int, int], ...]) -> tuple[l
 
 
 def _fit(rows: BalanceRows, least: float) -> Solved:
-    """Return J/K, dry and viscous friction and offset, fitted with the terms that the data ask for.
+    """Fit J/K, dry and viscous friction and offset, with further terms if the data show them.
 
-    A fan's drag or a load that changes with position only if it is clear. What is not clear may be there all the same:
-    by what it would change, the intervals are wider.
+    A fan's drag or a position-dependent load is included only if it is significant; otherwise it may still exist, so
+    the intervals are widened by the change that it would make.
 
     Args:
         rows: The balance.
-        least: The least slope that cogging and offsets do not make [A/rad].
+        least: Least slope that cogging and offsets cannot cause [A/rad].
     """
     X, y, duration, moves = rows.columns, rows.charge, rows.duration, rows.moves
     chosen = [0, 1, 2, 3]

@@ -1,4 +1,4 @@
-"""The equation of motion of an axis under smooth weights, and its unknowns by least squares."""
+"""The equation of motion of an axis under smooth weights, and its solution by least squares."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ from drive_env.trials.positioning import CYCLE
 from mechanics.arrays import Floats, Integers
 
 SMOOTHED = 9  # samples over which a signal is averaged
-STANDS, SLOWEST = 0.02, 0.5  # share of the greatest speed, and rad/s: about standstill the sign of friction changes
+STANDS, SLOWEST = 0.02, 0.5  # of the greatest speed, and rad/s: below, the sign of friction changes gradually
 
 
 class Motion(NamedTuple):
-    """A motion of one axis, shape (samples,) each."""
+    """A motion of one axis, each field of shape (samples,)."""
 
     angle: Floats  # rad
     current: Floats  # A
     speed: Floats  # rad/s
-    smooth: Floats  # rad/s, averaged
+    smooth: Floats  # rad/s, moving average
     sign: Floats  # -1...1: the direction of dry friction
 
 
 class BalanceRows(NamedTuple):
-    """The balance under n weights.
+    """The momentum balance under n weights.
 
-    columns: Of J/K, dry friction, viscous friction, offset, slope over the angle, drag; shape (n, 6).
+    columns: Coefficients of J/K, dry friction, viscous friction, offset, slope over the angle, drag; shape (n, 6).
     charge, duration: [A*s] and [s], shape (n,).
-    moves: Which move each belongs to, shape (n,).
-    weights: Shape (n, samples).
+    moves: Number of the move of each row, shape (n,).
+    weights: The weights, shape (n, samples).
     """
 
     columns: Floats
@@ -41,7 +41,7 @@ class BalanceRows(NamedTuple):
 
 
 class Solved(NamedTuple):
-    """Unknowns, in the order of the columns, their deviations, and the degrees of freedom."""
+    """The solution in the order of the columns: values, standard deviations, and degrees of freedom."""
 
     mean: Floats
     spread: Floats
@@ -52,7 +52,7 @@ def motion(angle: Floats, current: Floats, demand: Floats) -> Motion:
     """Return an axis' motion from its angles [rad], currents [A] and set-points of speed [rad/s], shape (samples,)."""
     speed = np.gradient(angle) / CYCLE
     smooth = smoothed(speed)
-    # The demand tells the size, and the speed the sign.
+    # The demand gives the threshold, the measured speed the sign.
     still = max(STANDS * float(np.abs(demand).max()), SLOWEST)
     return Motion(angle, current, speed, smooth, np.clip(smooth / still, -1.0, 1.0))
 
@@ -63,12 +63,12 @@ def smoothed(signal: Floats) -> Floats:
 
 
 def step(t: Floats, begin: float, end: float) -> Floats:
-    """Return a smooth step from 0 at `begin` to 1 at `end`, at times of the same unit."""
+    """Return a smooth step from 0 at `begin` to 1 at `end`; all times in the same unit."""
     return np.asarray(0.5 - 0.5 * np.cos(np.pi * np.clip((t - begin) / (end - begin), 0.0, 1.0)))
 
 
 def balance_rows(did: Motion, weights: Sequence[Floats], moves: Sequence[int]) -> BalanceRows:
-    """Return the balance under weights, shape (samples,) each, of the moves they belong to."""
+    """Return the momentum balance under weights, shape (samples,) each, with the number of each one's move."""
     w = np.array(weights)
     away = did.angle - float(did.angle.mean())
     signals = np.stack([did.sign, did.speed, np.ones_like(away), away, np.abs(did.speed) * did.speed], axis=1)
@@ -83,7 +83,7 @@ def balance_rows(did: Motion, weights: Sequence[Floats], moves: Sequence[int]) -
 
 
 def solve(X: Floats, y: Floats, duration: Floats, moves: Integers) -> Solved:
-    """Least squares, weighted by duration, with deviations for errors that are alike within a move."""
+    """Solve by least squares weighted by duration; the deviations assume errors that are equal within a move."""
     weight = 1.0 / np.sqrt(duration)
     scale = np.maximum(np.sqrt(np.mean(X**2, axis=0)), 1e-15)
     A, b = X / scale * weight[:, None], y * weight

@@ -1,6 +1,6 @@
-"""The inertia that an axis pushes while all axes of its machine accelerate alike, as in the moves of an identification.
+"""The inertia that an axis moves if all axes of its machine accelerate equally, as in the moves of an identification.
 
-`mechanics.shaft` says what an axis sees that turns alone; where axes are coupled the two differ.
+`mechanics.shaft` computes that of an axis that turns alone; for coupled axes the two differ.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ if TYPE_CHECKING:
     from mechanics.packed import PackedLoad
     from tuning.target import Target
 
-LEAST_SHARE = 0.2  # of the inertia of an axis that turns alone: what others take off it is taken for no more than that
+LEAST_SHARE = 0.2  # of the inertia of an axis that turns alone: lower bound of the result
 
 
 def moved_inertia(load: PackedLoad) -> Floats:
-    """Return total inertia, rotors and load [kg*m^2], of every copy's axes where the load starts, (copies, axes).
+    """Return total inertia, rotor and load [kg*m^2], of every copy's axes at the load's first position, (copies, axes).
 
-    With B the ways of the axes and M the joints' mass matrix, tau = B M B^T alpha: for accelerations that are alike,
-    the rows of B M B^T summed.
+    With the axes' motions B and the joints' mass matrix M, tau = B M B^T alpha: for equal accelerations the result is
+    the sum of each row of B M B^T.
     """
     turning = way(load).joints
     at_axes = np.einsum("ad,cde,be->cab", turning, load.mass_matrix(), turning)
@@ -34,9 +34,9 @@ def moved_inertia(load: PackedLoad) -> Floats:
 
 
 def true_inertia(target: Target) -> Floats:
-    """Return the inertia of emulated axes as a perfect identification finds it: over the true K_t, times the nominal.
+    """Return the inertia of emulated axes that an exact identification gives: over the true K_t, times the nominal.
 
-    The axes of a machine move together: an axis pushes its own inertia, and what the others' acceleration puts on it.
+    The axes of a machine accelerate together: an axis moves its own inertia and the coupling with the others.
     """
     moved = np.concatenate([moved_inertia(group.load) for group in emulated_of(target.drives).inside.groups])
     share = machine_of(target.drives).parameters["motor.psi_m"] / target.motor.psi_m

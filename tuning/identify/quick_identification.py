@@ -1,10 +1,10 @@
-"""Identification in half the time, for tuning: the same checks and the same response, and moves that are soon over.
+"""Identification in half the time, for tuning: the same checks and the same response, but short moves.
 
-Where `identify` moves an axis for five seconds to know inertia and friction within a few percent, two moves of a
-quarter of a second must do here; the frequency response then says the inertia again, and better.
+`identify` moves an axis for five seconds to know inertia and friction within a few percent; here two moves of a quarter
+of a second are enough, since the frequency response gives the inertia again, and better.
 
-A tuner's twins need a value even where it is only a guess, and their variants are as far apart as the guesses are
-uncertain: `Identification.estimates` has those. The identified values, without guesses, are in `Identification.told`.
+A tuner's twins need a value even if it is only assumed, and their variants differ by the uncertainty of these values:
+`Identification.estimates` includes them. `Identification.told` has identified values only.
 """
 
 from __future__ import annotations
@@ -37,18 +37,18 @@ from tuning.target import Target
 if TYPE_CHECKING:
     from tuning.response.plant_fit import PlantFit
 
-# Half of an interval over its value, for twins alone: of what two moves tell, and of what a fit refuses to state.
+# Half width of an interval over its value, for twins only: of results of two moves, and of values that a fit refuses.
 INERTIA_ERROR, FRICTION_ERROR = 0.15, 0.3
 DOUBT = {"inertia": 0.2, "velocity_filter": 0.4, "anti_resonance": 0.1, "resonance": 0.1, "damping": 0.5}
-LEAST_WAY = 1.0  # rad that all axes of a machine must have to either side for what they push for one another
-# Of the inertia of the moves: a response that says less was measured within the play of a gear. On 20 drawn axes
-# without one it says 0.93 to 1.04; on three with one 0.51, 1.05 and 1.34.
+LEAST_WAY = 1.0  # rad of room to either side that all axes of a machine need to measure their coupling
+# Inertia by the response over that by the moves: a lower ratio means that it was measured within the backlash of a
+# gear. On 20 drawn axes without backlash it is 0.93 to 1.04; on three with it 0.51, 1.05 and 1.34.
 LOOSE = 0.75
-# The same of an axis of several: shaken fast, the others give way, which are held in the moves: of a mass matrix M it
-# says 1 - M12^2 / (M11 M22), of two links of a SCARA 0.64 and 0.74.
+# The same for one axis of several: in a fast excitation the other axes give way, in moves they are held: with mass
+# matrix M the ratio is 1 - M12^2 / (M11 M22), for two links of a SCARA 0.64 and 0.74.
 LOOSE_BESIDE_OTHERS = 0.5
-ANOTHER = 2.5  # times the inertia that two moves tell: a response that says more is that of another axis
-# Of 46 axes of the suite one had its viscous friction and 13 their dry friction within FRICTION_ERROR.
+ANOTHER = 2.5  # greatest ratio: a response with more inertia is that of another axis
+# Of 46 axes of the suite, the friction error was below FRICTION_ERROR on 1 (viscous) and 13 (dry).
 SHORT, LONGER = "two moves of a quarter of a second do not separate it from", "`drive-tune identify` measures longer"
 NOT_TOLD = {
     "inertia": "two moves of a quarter of a second give it too roughly, and no frequency response was measured",
@@ -60,7 +60,7 @@ OF_ALL = (
     "in the frequency response the axis moved the mass shared by all axes of its machine, and two moves of a quarter "
     "of a second give its own part too roughly"
 )
-# Dead time and friction make it up to 0.09 ms shorter here, to one side, which no scatter shows.
+# Dead time and friction shorten the measured delay by up to 0.09 ms here, which no scatter shows.
 NO_DELAY = (
     "so short a frequency response gives it to 0.1 ms only, which is no better than the period of the drive's velocity "
     "loop"
@@ -68,27 +68,27 @@ NO_DELAY = (
 
 
 def identify_briefly(target: Target, where: Mask | None = None) -> list[Identification]:
-    """Identify axes, all by default, in about four seconds for each of a machine.
+    """Identify axes, all by default, in about 4 s for each axis of a machine.
 
-    Otherwise as `identify`; those of one machine move one after the other, or all if linked.
+    Otherwise as `identify`; axes of one machine move one after the other, or together if linked.
 
     Returns:
-        One per axis. Its `told` is what is identified; in place of most of what is refused there its `estimates` have
-        guesses, for twins.
+        One identification per axis. Its `told` has the identified values; its `estimates` have assumed values, for
+        twins, instead of most refused ones.
     """
     axes = np.ones(target.num_axes, bool) if where is None else where
     return _Brief(target, axes, lambda what, share: None).run()
 
 
 class _Brief(Experiments):
-    """Those experiments, with another middle."""
+    """`Experiments` with shorter moves and assumed values."""
 
     thorough = False
-    corrects = True  # a tuner is to leave a drive that turns
+    corrects = True  # a tuner must leave a drive that can turn
 
     def __init__(self, target: Target, where: Mask, progress: Progress) -> None:
         super().__init__(target, where, progress)
-        # The estimates of each axis by measurement, where `found` has a guess.
+        # Measured estimates of each axis for which `found` has an assumed value.
         self._told: list[dict[str, Estimate]] = [{} for _ in range(target.num_axes)]
         self._pushed: list[tuple[float, ...]] = [() for _ in range(target.num_axes)]
 
@@ -117,7 +117,7 @@ class _Brief(Experiments):
         write_gains(drives, cautious_gains(target, GUESS * target.motor.inertia), working.where)
         motion.select_mode(drives, "pp", working.where)
         down, up = working.room()
-        # t_0 scales a figure that is not asked for here.
+        # the settling time scale is not used here
         trials = Trials(drives, target.motor, target.axes_per_machine, 1.0)
         inertia = np.full(target.num_axes, GUESS * target.motor.inertia)
         reach = trial_reach(target, inertia, holding, longer_way(down, up))
@@ -132,16 +132,16 @@ class _Brief(Experiments):
         self.respond(working, inertia)
 
     def _move_together(self, working: Working, trials: Trials, holding: Floats) -> Working:
-        """Find the inertia that axes of one machine push while all of them move; return those without oscillation."""
+        """Find the inertia that axes of a machine move if all of them move; return the axes that did not oscillate."""
         target, lanes = working.target, working.target.axes_per_machine
         whole = np.repeat(working.where.reshape(-1, lanes).all(axis=1), lanes)
-        if lanes == 1 or target.linked or not whole.any():  # which have moved together as it is
+        if lanes == 1 or target.linked or not whole.any():  # linked axes have already moved together
             return working
-        # With the slow gains no axis follows a move that the others shake.
+        # Slow gains: no axis follows the motion that the others cause.
         write_gains(target.drives, method_of(target.device, target.motor).first(target.supply), whole)
         down, up = working.room()
-        # All axes the same way, and then each the other way than the others, as far: of axes that stand still, dry
-        # friction holds some of what the others push.
+        # First all axes in the same direction, then each opposite to the others, by the same angle: on axes at rest,
+        # dry friction would hold part of what the others push.
         either = np.repeat(np.minimum(-down, up).reshape(-1, lanes).min(axis=1), lanes)
         able = whole & (either >= LEAST_WAY)
         far = np.where(able, either, longer_way(down, up))
@@ -189,13 +189,13 @@ class _Brief(Experiments):
                 continue
             ratio = fit.plant.inertia / self.found[k]["inertia"].value
             if not 1.0 / ANOTHER < ratio < ANOTHER:
-                # A fit of few lines may come to rest anywhere, and the two moves went well enough.
+                # A fit with few lines may converge anywhere; the two moves were good enough.
                 self._no_response(
                     k, f"the frequency response would need {ratio:.2g} times the inertia found in the moves"
                 )
                 continue
             if ratio < (LOOSE if target.axes_per_machine == 1 else LOOSE_BESIDE_OTHERS) and not target.linked:
-                # Within the play of a gear the motor turns alone, and a small shaking does not leave it.
+                # Within backlash the motor turns alone, and a weak excitation does not leave it.
                 self._no_response(k, loose(ratio))
                 continue
             moved = self.found[k]["inertia"]
@@ -215,14 +215,14 @@ class _Brief(Experiments):
 
 
 def pushed_inertia(ways: Floats, inertia: Floats) -> Floats:
-    """Return the mass matrix of axes at their rotors [kg*m^2], (axes, axes), from the inertias pushed while all moved.
+    """Return the mass matrix of axes at their rotors [kg*m^2], (axes, axes), from the inertias in moves of all axes.
 
     Args:
-        ways: Which way each axis went, 1 or -1, (moves, axes): all alike first.
-        inertia: What each pushed over its own acceleration [kg*m^2], likewise.
+        ways: Direction of each axis in each move, 1 or -1, (moves, axes); in the first move all are equal.
+        inertia: Torque of each axis over its own acceleration [kg*m^2], (moves, axes).
 
     Returns:
-        A symmetric one; of one move a diagonal one, in which each axis has all that it pushes.
+        A symmetric matrix; from a single move a diagonal one.
     """
     if len(ways) == 1:
         return np.diag(inertia[0])
@@ -234,7 +234,7 @@ def pushed_inertia(ways: Floats, inertia: Floats) -> Floats:
 
 
 def loose(ratio: float) -> str:
-    """Return the message about a response that gives this share of the inertia of the moves."""
+    """Return the message about a response with this ratio to the inertia of the moves."""
     return (
         f"the frequency response gives {ratio:.2f} times the inertia found in the moves: it was measured within the "
         "play of a gear, where the motor turns alone"
@@ -242,7 +242,7 @@ def loose(ratio: float) -> str:
 
 
 def _turns(working: Working) -> list[Mask]:
-    """Return which axes move when: those of a machine one after the other, since each pulls at the next; or linked."""
+    """Return which axes move at the same time: linked axes together, others of a machine one after the other."""
     lanes = working.target.axes_per_machine
     if working.target.linked:
         return [working.where]
@@ -251,11 +251,11 @@ def _turns(working: Working) -> list[Mask]:
 
 
 def _told(fit: PlantFit, highest: float) -> dict[str, Estimate]:
-    """Return the estimates of a fit alone, up to the highest frequency [Hz]; its refusals are the reasons."""
+    """Return the estimates of a fit up to the highest frequency [Hz], with its refusals."""
     told = {name: fit.estimates[name] for name in ("inertia", *RESPONSE)}
     told["loop_delay"] = refused(UNITS["loop_delay"], NO_DELAY)
     if fit.plant.is_elastic and fit.plant.resonance > highest:
-        # What lies there may as well be the filter's own lag.
+        # A resonance there cannot be told from the filter's lag.
         reason = f"a resonance above {highest:.0f} Hz, the highest frequency measured, cannot be separated from it"
         told["velocity_filter"] = refused(UNITS["velocity_filter"], reason)
     if fit.misfit > WORST_MISFIT:
@@ -265,7 +265,7 @@ def _told(fit: PlantFit, highest: float) -> dict[str, Estimate]:
 
 
 def _guessed(fit: PlantFit) -> dict[str, Estimate]:
-    """Return the estimates of a fit, with wide intervals in place of refusals: a twin needs a guess."""
+    """Return the estimates of a fit with wide intervals instead of refusals: a twin needs a value."""
     found = dict(fit.estimates)
     values = {"inertia": fit.plant.inertia, "velocity_filter": fit.plant.velocity_filter}
     if fit.plant.is_elastic:

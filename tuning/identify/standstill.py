@@ -1,11 +1,11 @@
-"""Winding resistance at rest, from readings that need no time of their own: for drives whose time does not wait.
+"""Winding resistance at rest, from readings without fixed timing: for drives in real time.
 
-With commutation in open loop (2055h) the current of 2004h lies along a field that stands still, and the rotor lies in
-it: no torque acts and nothing turns. The flux regulator's integrator (`Role.FLUX_ERROR_SUM`) then holds the whole duty,
+With commutation in open loop (2055h) the current of 2004h points along a field at rest, and the rotor aligns with it:
+no torque acts and nothing turns. The flux regulator's integrator (`Role.FLUX_ERROR_SUM`) then holds the whole duty,
 
     V duty = R i + V t_dead f(i)
 
-and between two currents that are large enough for dead time to lose the same from both, R is what is left.
+and between two currents that are large enough for dead time to lose equal voltages, only R remains.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from tuning.identify.working_state import BY_FIELD, Working, enable, still_enabl
 from tuning.response.dead_time import dead_time
 from tuning.stop_causes import stop_causes
 
-LEVELS = (0.9, 0.7, 0.5)  # over what may be asked for
-ROUNDS = 3  # there and back, and there again
-SETTLE, APART, READINGS = 60, 3, 8  # cycles until a current stands, and from reading to reading; how many
-MOST_ERROR = 0.05  # of the current: a larger mean error has not settled, or the voltage does not suffice
-MOST_TURN = 0.2  # electrical rad between readings: a rotor that goes on turning is not held
-MODEL = 0.013  # of R, 95 %: what is left out, as sag of the supply and the switches' own resistance
-GRID = 5  # values of what dead time may be
+LEVELS = (0.9, 0.7, 0.5)  # of the allowed current
+ROUNDS = 3  # series of levels, in alternating direction
+SETTLE, APART, READINGS = 60, 3, 8  # cycles: until a current is settled; between readings; number of readings
+MOST_ERROR = 0.05  # of the current: with a larger mean error it has not settled, or the voltage is too low
+MOST_TURN = 0.2  # electrical rad between readings: a rotor that turns further is not held
+MODEL = 0.013  # of R, 95 %: effects not modelled, such as sag of the supply and resistance of the switches
+GRID = 5  # number of values of dead time tried
 
 
 def standstill_resistances(working: Working) -> list[Estimate]:
-    """Return the winding's resistance of every axis, per phase, or why not; all axes are off before and after."""
+    """Measure every winding's resistance, per phase, or say why that is impossible; axes are off before and after."""
     target, drives = working.target, working.target.drives
     if target.motor.kind == "dc":
         return [refused("ohm", (
@@ -86,7 +86,7 @@ def standstill_resistances(working: Working) -> list[Estimate]:
 
 
 def _resistance(working: Working, k: int, current: Floats, duty: Floats, field: float) -> Estimate:
-    """Estimate the resistance from duties at currents [A], shape (n,) each, the field standing at an angle [rad]."""
+    """Estimate the resistance from duties at currents [A], shape (n,) each, with the field at an angle [rad]."""
     target, stage = working.target, working.target.device.stage
     supply = float(target.supply[k])
     link = supply - stage["supply_resistance"].default * (1.5 * np.maximum(duty * current, 0.0) + SUPPLY_IDLE)
@@ -96,7 +96,7 @@ def _resistance(working: Working, k: int, current: Floats, duty: Floats, field: 
     rest = link * duty - X @ np.linalg.lstsq(X, link * duty, rcond=None)[0]
     freedom = len(current) - 2
     scatter = t_quantile(freedom) * float(np.sqrt(rest @ rest / freedom)) * float(np.linalg.norm(slopes))
-    # What dead time takes more from the greater currents, by all that it may be; along d as along q a quarter before.
+    # Extra voltage that dead time takes from greater currents, over its range; d acts like q a quarter turn before.
     share = np.linspace(stage["dead_time"].low, stage["dead_time"].high, GRID) * target.device.current_rate
     fades = np.geomspace(stage["dead_time_current"].low, stage["dead_time_current"].high, GRID)
     lost = [float(slopes @ dead_time(np.full(len(current), field - 0.5 * np.pi), current, s, False)) for s in fades]

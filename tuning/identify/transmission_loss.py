@@ -1,18 +1,19 @@
-"""The losses of a screw or a gear in proportion to the transmitted torque, where the moves of an axis show them.
+"""The losses of a screw or a gear proportional to the transmitted torque, if the moves of an axis show them.
 
-While the motor drives the load, the loss adds to what it carries; while the load drives the motor, it takes from it.
-With i_L the current behind the rotor and behind the friction before the transmission, and T what is carried,
+While the motor drives the load, the loss adds to the transmitted torque; while the load drives the motor, it reduces
+it. With i_L the current behind the rotor and behind the friction before the transmission, and T the transmitted torque,
 
-    i_L = (1 + loss) T while i_L has the sign of the speed,    i_L = (1 - loss) T while it has the other one.
+    i_L = (1 + loss) T while i_L has the sign of the speed,    i_L = (1 - loss) T while it has the opposite sign.
 
 An axis that always drives shows (1 + loss) times its load's inertia, and so does each part of a braking in which
-friction brakes more than is needed; the balance of a whole move cancels only the rest. How much of the friction lies
-before the transmission is not known: the inertia is that of the middle, and the interval holds those of both ends. A
-loss that is not clear may be there all the same, hidden by friction that brakes enough: the interval holds it, too.
+friction brakes more than is needed; the balance of a whole move cancels only the rest. The share of the friction before
+the transmission is unknown: the inertia is computed for half of it, and the interval includes that for none and for
+all. A loss that is not significant may still exist, hidden by friction that brakes enough: the interval includes it,
+too.
 
-A load behind play glides: after a change of speed it runs along by itself, in the gap, for as long as a cruise lasts,
-and the motor then shows less friction than there is. From standstill to standstill nothing hides so, but the loss
-matters there. So friction is estimated twice, from cruises and from whole ways, and the interval holds both.
+A load behind backlash glides: after a change of speed it runs free within the gap for the whole cruise, and the motor
+then shows too little friction. Moves from standstill to standstill do not hide it, but there the loss matters. So
+friction is estimated twice, from cruises and from whole ways, and the interval includes both.
 """
 
 from __future__ import annotations
@@ -31,20 +32,20 @@ if TYPE_CHECKING:
 
 Cruises = tuple[tuple[int, int, int], ...]
 
-CLEAR = 3.0  # times its deviation: from here on it is taken out of friction; below, inertia's interval becomes wider
-MOST = 2.0 / 3.0  # share of a loss that may hide: of a quarter of the transmitted torque
-BEFORE = (0.5, 0.0, 1.0)  # share of friction that lies before the transmission: the middle, and both ends
-TURNING = 0.15  # of a ramp, about standstill: there friction breaks away, and play is passed
-STEEP = 0.5  # of a ramp, on which a weight fades
-EDGE = 1.0 / 3.0  # of a ramp to either side of standstill: where a whole way begins and ends
+CLEAR = 3.0  # times its standard deviation: a clearer loss is taken out of friction; else inertia's interval is widened
+MOST = 2.0 / 3.0  # greatest share that may be hidden: loss of a quarter of the transmitted torque
+BEFORE = (0.5, 0.0, 1.0)  # shares of friction before the transmission: middle, and both ends
+TURNING = 0.15  # of a ramp, around standstill: omitted, since friction breaks away and backlash is crossed there
+STEEP = 0.5  # of a ramp, over which a weight fades out
+EDGE = 1.0 / 3.0  # of a ramp to either side of standstill: begin and end of a whole way
 
 
 class Loss(NamedTuple):
     """The loss of a transmission.
 
-    while_braking: What it gives back while it brakes, per sample [A], less what it does so in cruises.
-    share: By how much more it shows while it drives than while it brakes; 2 loss / (1 - loss).
-    is_clear: Whether the moves show it beyond chance.
+    while_braking: Braking current per sample [A], less its mean in cruises.
+    share: Relative difference between driving and braking; 2 loss / (1 - loss).
+    is_clear: Whether it is significant in the moves.
     """
 
     while_braking: Floats
@@ -57,18 +58,18 @@ class Loss(NamedTuple):
         return self.share / (2.0 + self.share)
 
     def load_alone(self, inertia: float, rotor: float) -> float:
-        """Return total inertia [kg*m^2] where one was seen whose load, all but the rotor, counts with its loss."""
+        """Correct a total inertia [kg*m^2] in which the load, all but the rotor, was counted with its loss."""
         return rotor + (inertia - rotor) / (1.0 + self.loss)
 
 
 def find_losses(did: Motion, cruises: Cruises, motor: Motor, friction: Floats) -> tuple[Loss, ...]:
-    """Return the loss for each of `BEFORE`: if not clear, the likely one, the most that may hide, and none.
+    """Return the loss for each of `BEFORE`: measured if clear, else the likely, the greatest possible, and none.
 
     Args:
-        did: What the axis did.
-        cruises: First and last sample of every cruise, and its move.
+        did: Motion of the axis.
+        cruises: First and last sample of every cruise, and the number of its move.
         motor: Its motor.
-        friction: Dry [A] and viscous [A*s/rad] friction, as the moves show it without a loss.
+        friction: Dry [A] and viscous [A*s/rad] friction, estimated without a loss.
     """
     weights, moves = _parts(did, cruises)
     rows = balance_rows(did, weights, moves)
@@ -88,13 +89,13 @@ def find_losses(did: Motion, cruises: Cruises, motor: Motor, friction: Floats) -
 
 
 def friction_of_whole_ways(did: Motion, cruises: Cruises, loss: Loss, inertia: float) -> Solved:
-    """Return dry and viscous friction and offset, [A], [A*s/rad], [A], from standstill to standstill.
+    """Return dry and viscous friction and offset, [A], [A*s/rad], [A], from moves from standstill to standstill.
 
     Args:
-        did: What the axis did.
-        cruises: As `find_losses` takes them.
-        loss: What its transmission loses.
-        inertia: J/K as the balance shows it with that loss [A*s^2/rad].
+        did: Motion of the axis.
+        cruises: As in `find_losses`.
+        loss: Loss of its transmission.
+        inertia: J/K by the balance with that loss [A*s^2/rad].
     """
     t = np.arange(len(did.angle), dtype=float)
     weights, moves = [], []
@@ -108,11 +109,11 @@ def friction_of_whole_ways(did: Motion, cruises: Cruises, loss: Loss, inertia: f
 
 
 def _while_braking(did: Motion, cruises: Cruises, motor: Motor, before: Floats) -> Floats:
-    """Return the part of the current behind the rotor that brakes, with the sign of the speed, per sample [A]."""
+    """Return the braking part of the current behind the rotor, with the sign of the speed, per sample [A]."""
     accelerating = motor.inertia / motor.torque_constant * smoothed(np.gradient(did.smooth) / CYCLE)
     behind = smoothed(smoothed(smoothed(did.current))) - accelerating - before[0] * did.sign - before[1] * did.smooth
     braking = np.maximum(-behind * did.sign, 0.0) * did.sign
-    # A weight that goes down brakes all the time: that is part of friction and offset as cruises show them.
+    # A descending weight brakes all the time: cruises show that as friction and offset, so it is subtracted.
     for there in (cruises[::2], cruises[1::2]):
         way = np.sign(sum(float(did.smooth[a:b].mean()) for a, b, _ in there))
         braking[way * did.sign > 0.0] -= float(np.concatenate([braking[a:b] for a, b, _ in there]).mean())
@@ -120,15 +121,15 @@ def _while_braking(did: Motion, cruises: Cruises, motor: Motor, before: Floats) 
 
 
 def _parts(did: Motion, cruises: Cruises) -> tuple[list[Floats], list[int]]:
-    """Return weights of cruises, brakings and accelerations apart, without standstill, and their moves."""
+    """Return weights of cruises, brakings and accelerations, without standstill, and the numbers of their moves."""
     t = np.arange(len(did.angle), dtype=float)
     weights, moves = [], []
     for first, last, ramp, number in _ramps(cruises):
-        begin = first + (last - first) // 5  # the loop swings in
+        begin = first + (last - first) // 5  # the loop is settling before
         middle = 0.5 * (begin + last)
         weights.append(np.minimum(step(t, begin, middle), 1.0 - step(t, middle, last)))
         there = any(a > last and move == number for a, _, move in cruises)
-        if there:  # it turns afterwards
+        if there:  # the axis turns afterwards
             end = last + ramp
             weights.append(step(t, middle, last) * (1.0 - step(t, end - STEEP * ramp, end - TURNING * ramp)))
         else:
@@ -139,7 +140,7 @@ def _parts(did: Motion, cruises: Cruises) -> tuple[list[Floats], list[int]]:
 
 
 def _ramps(cruises: Cruises) -> list[tuple[int, int, int, int]]:
-    """Return first and last sample of every cruise, its ramp [samples], and its move; between two there are two."""
+    """Return first and last sample of every cruise, its ramp [samples], and its move; two ramps lie between cruises."""
     both: dict[int, list[tuple[int, int]]] = {}
     for first, last, number in cruises:
         both.setdefault(number, []).append((first, last))

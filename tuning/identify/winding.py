@@ -1,15 +1,15 @@
-"""Winding resistance and inductance, from the current regulator's integrator and the entered supply voltage.
+"""Winding resistance and inductance from the current regulator's integrator and the entered supply voltage.
 
 The integrator adds P I e every tick, so its change over a millisecond is the sum of the current's error over all 25
-ticks, at far better resolution than a sample of the current has. Set-point less error is the mean current, P e plus
-the integrator the mean duty; what is left is the winding's balance of flux over each millisecond,
+ticks, with much better resolution than a sample of the current. Set-point less error is the mean current, P e plus the
+integrator the mean duty; the rest is the winding's balance of flux over each millisecond,
 
     integral of V duty = R integral of i + L (i_end - i_start) + K_e (theta_end - theta_start) + V t_dead f(i) + c
 
-whose unknowns are found by least squares over some hundred milliseconds of current pulses, forth and back, that hardly
-move the rotor. f is what dead time loses: it saturates at a current that is not known either and is averaged over.
-K_e and the dead time have priors, the data sheet's and the stage's ranges: where the rotor hardly moves they matter
-little, and elsewhere the data says better.
+Its unknowns are fitted by least squares over some hundred milliseconds of current pulses in both directions that hardly
+move the rotor. f is the relative voltage loss by dead time: it saturates at an unknown current, over which the result
+is averaged. K_e and dead time have priors, the data sheet's and the stage's ranges: if the rotor hardly moves they
+matter little, otherwise the data dominate.
 """
 
 from __future__ import annotations
@@ -32,58 +32,59 @@ from tuning.response.dead_time import dead_time
 from tuning.stop_causes import stop_causes
 from tuning.target import Target
 
-# Amplitude of a pulse over what may be asked for, and the cycles that a level lasts; a pulse is +, -, -, +, so that
-# speed and way end at 0. Short ones hold as many changes of the current in a third of the time: they say the
-# inductance, long ones the resistance, and those of little current what dead time loses.
+# Amplitude of a pulse over the allowed current, and the cycles of a level; a pulse is +, -, -, +, so that speed and way
+# end at 0. Short ones have as many changes of the current in a third of the time: they give the inductance, long ones
+# the resistance, and those with little current the loss by dead time.
 PULSES = ((0.95, 3), (0.95, 1), (0.95, 1), (0.7, 3), (0.7, 1), (0.45, 3), (0.25, 3))
 REPEATS, BRIEFLY = 8, 6
-LOOP_GAIN, LOOP_HZ = 4.0, 600.0  # P of the loop: so many winding resistances, up to this bandwidth
-# Of the current limit: from here on the loop overcomes what dead time takes. On mains that is more than R times the
-# current, and a loop of a few R lets nothing flow, which a drive takes for an open phase.
+LOOP_GAIN, LOOP_HZ = 4.0, 600.0  # P of the loop: in winding resistances, up to this bandwidth
+# Of the current limit: from this current on the loop overcomes dead time. At mains voltage that takes more than R times
+# the current; in a loop of a few R no current would flow, which a drive reports as an open phase.
 OVERCOMES = 0.25
-INTEGRAL_SHARE = 0.1  # of the integral gain that cancels the winding's lag: an instrument, not a controller
-LEAST_INTEGRAL = 8  # of 65536, a share of P e per tick: below it the sum over a millisecond says too little
-HOLD_HZ, HOLD_DAMPING = 7.0, 0.7  # our own slow position loop around the pulses
-# Over the data sheet's, centre and deviation: unit-to-unit spread and temperature.
+INTEGRAL_SHARE = 0.1  # of the integral gain that cancels the winding's lag: it measures, it need not control
+LEAST_INTEGRAL = 8  # of 65536, a share of P e per tick: with less the sum over a millisecond is too coarse
+HOLD_HZ, HOLD_DAMPING = 7.0, 0.7  # our own slow position loop during the pulses
+# Over the data sheet's value, mean and standard deviation: unit-to-unit spread and temperature.
 RESISTANCE_PRIOR, EMF_PRIOR = (1.1, 0.25), (0.965, 0.06)
-# Of R and L, 95 %: what the balance leaves out, as sag of the supply, lag of the encoder, what a tick hides.
+# Relative error of R and L, 95 %, by effects not modelled: sag of the supply, lag of the encoder, changes within a
+# tick.
 RESISTANCE_MODEL, INDUCTANCE_MODEL = 0.01, 0.02
-# The same, over the share that dead time loses of what drives the current: how it fades at small currents is unknown.
+# The same, per share of the driving voltage lost by dead time: how it fades at small currents is unknown.
 RESISTANCE_LOSS, INDUCTANCE_LOSS = 0.12, 0.07
-LEAST_NOISE = 0.005  # of the flux: a better fit than that is not taken for knowledge
-SATURATIONS = 8  # currents at which dead time may saturate that are tried
-MOST_ROUNDS, SETTLED = 12, 2e-3  # of the fit, and the share by which values still change in the end
-SUPPLY_IDLE = 0.1  # A, what logic draws through the supply line
-WIDEST = 0.1  # half of an interval over its value: what is wider is no identification
+LEAST_NOISE = 0.005  # of the flux: a smaller residual does not make the result more certain
+SATURATIONS = 8  # number of currents tried at which dead time may saturate
+MOST_ROUNDS, SETTLED = 12, 2e-3  # of the fit, and the relative change of values at which it ends
+SUPPLY_IDLE = 0.1  # A, that the logic draws through the supply line
+WIDEST = 0.1  # greatest half width of an interval over its value
 
 
-PROBE = 10  # rows at rest by which it is seen how long the reads take, on a bus in real time
-LATE, MOST_LATE = 1.5, 0.02  # cycles from row to row that are too many, and the share of rows that may have them
+PROBE = 10  # rows at rest that measure how long the reads take on a bus in real time
+LATE, MOST_LATE = 1.5, 0.02  # cycles between rows: more is late; and the greatest share of late rows
 
 TURN = 2  # column of the balance
 
 
 class Pulses(NamedTuple):
-    """A recording, one row per millisecond: n rows, or n + 1 where both ends count; (rows, num_axes)."""
+    """A recording with one row per millisecond: n rows, or n + 1 if both ends count; (rows, num_axes)."""
 
     demand: Floats  # A, n
     current: Floats  # A, n + 1: the last tick's
     angle: Floats  # rad, n + 1
     duty_sum: Floats  # n + 1
-    block: Integers  # n: which pulse
-    alive: Mask  # num_axes: enabled to the end
-    step: float = CYCLE  # s from row to row; more if the reads were out of step with the drive
+    block: Integers  # n: number of the pulse
+    alive: Mask  # num_axes: enabled until the end
+    step: float = CYCLE  # s from row to row; more if the reads could not keep up with the drive
 
 
 class Winding(NamedTuple):
-    """Estimates of one axis' winding by pulses."""
+    """Estimates of one axis' winding from pulses."""
 
     resistance: Estimate
     inductance: Estimate
 
 
 def loop_gains(working: Working) -> tuple[Floats, float]:
-    """Return raw P of the current loop of every axis, and I, of the loop that serves as an instrument."""
+    """Return raw P of the current loop of every axis, and raw I, for a loop that measures rather than controls."""
     target, motor = working.target, working.target.motor
     known, per = target.device.gains, per_chip(target.device)
     top_p, top_i = (known.rows[k].highest for k in _columns(target))
@@ -98,13 +99,13 @@ def loop_gains(working: Working) -> tuple[Floats, float]:
 
 
 def _columns(target: Target) -> tuple[int, int]:
-    """Return which gains are P and I of the current loop."""
+    """Return the columns of P and I of the current loop."""
     P, integral, *_ = cascade_columns(target.device)
     return P, integral
 
 
 def pulse(working: Working, holding: Floats, repeats: int = REPEATS) -> Pulses:
-    """Give current pulses in cst around the holding currents [A]; the axes are enabled in cst, at rest."""
+    """Apply current pulses in cst around the holding currents [A]; the axes are enabled in cst, at rest."""
     target, drives = working.target, working.target.drives
     motor, count = target.motor, target.num_axes
     P, integral = loop_gains(working)
@@ -117,7 +118,7 @@ def pulse(working: Working, holding: Floats, repeats: int = REPEATS) -> Pulses:
     levels, blocks = _levels(repeats)
     in_real_time = not drives.time_waits
     per_count = ampere_per_count(drives)
-    # Where time does not wait for the reads, first only: how long do they take?
+    # On a bus in real time, first measure how long the reads take.
     for played in (np.zeros(PROBE), levels) if in_real_time else (levels,):
         rows = len(played)
         demand = np.zeros((rows, count))
@@ -149,12 +150,12 @@ def pulse(working: Working, holding: Floats, repeats: int = REPEATS) -> Pulses:
 
 
 def identify_winding(working: Working, pulses: Pulses, electrical_angle: Floats, pole_pairs: float) -> list[Winding]:
-    """Return resistance and inductance of every axis.
+    """Estimate resistance and inductance of every axis.
 
     Args:
         working: The drives.
-        pulses: What `pulse` recorded.
-        electrical_angle: Where the rotors stood at the first row [rad], shape (num_axes,).
+        pulses: Recording of `pulse`.
+        electrical_angle: Angles of the rotors at the first row [rad], shape (num_axes,).
         pole_pairs: Electrical turns per turn in the direction of counting.
     """
     if pulses.step > CYCLE:
@@ -175,7 +176,7 @@ def identify_winding(working: Working, pulses: Pulses, electrical_angle: Floats,
 
 
 class _Window(NamedTuple):
-    """Each millisecond's part of the balance, shape (n,), and the currents within it by the model, (n, ticks)."""
+    """The terms of the balance of each millisecond, shape (n,), and the modelled currents within it, (n, ticks)."""
 
     flux: Floats  # V s
     charge: Floats  # A s
@@ -211,7 +212,7 @@ def _levels(repeats: int) -> tuple[Floats, Integers]:
 
 
 class _Regulator(NamedTuple):
-    """The current loop of an axis, as it is simulated."""
+    """The simulated current loop of an axis."""
 
     P: float  # duty per ampere
     share: float  # of P e, by which the integrator grows every tick
@@ -221,13 +222,13 @@ class _Regulator(NamedTuple):
 
 
 class _WindingModel(NamedTuple):
-    """The winding of an axis, as a round of the fit takes it."""
+    """The winding of an axis in one round of the fit."""
 
     R: float
     L: float
     emf: float  # K_e
-    lost: float  # V, by dead time
-    saturation: float  # A, from which on dead time loses that
+    lost: float  # V, lost by dead time
+    saturation: float  # A, from which dead time loses the full voltage
     brushed: bool
 
 
@@ -250,7 +251,7 @@ def _winding(working: Working, axis: _AxisWinding, k: int, electrical: float, po
     results: list[_Solved] = []
     R, L, lost = motor.R_s, motor.L_q, 0.0
     for saturation in map(float, np.geomspace(row.low, row.high, SATURATIONS)):
-        # What happens within a millisecond is modelled with the values of the round before, until they stay.
+        # Currents within a millisecond are modelled with the values of the last round, until these converge.
         for _ in range(MOST_ROUNDS):
             before = np.array([R, L, lost])
             window = _window(working, axis, regulator, _WindingModel(R, L, emf, lost, saturation, brushed), angle)
@@ -273,9 +274,9 @@ def _window(
     turn = np.diff(axis.angle)
     r, s_0 = axis.demand, axis.duty_sum[:-1]
     errors = np.diff(axis.duty_sum) / (P * share)  # sum over the ticks
-    # What happens tick by tick, by the model: from where the last millisecond ended.
+    # Simulate tick by tick from the end of the last millisecond.
     start = axis.current[:-1].copy()
-    # A count is a large part of a millisecond's turn: smoothed, where it is only used to model.
+    # A count is a large part of a millisecond's turn: smoothed, since it is only used for modelling.
     back = model.emf * np.convolve(np.pad(turn, 1, mode="edge"), (0.25, 0.5, 0.25), mode="valid") / CYCLE
     for _ in range(2):
         path = _simulate(axis, start, back, angle, regulator, model)
@@ -289,14 +290,14 @@ def _window(
     # A duty acts one tick late.
     duty = P * errors + sums - last[1:] + last[:-1]
     charge = dt * (ticks * r - errors + 0.5 * (ends[1:] - ends[:-1]))
-    # The encoder was read at the last window of the velocity loop: a turn is that much older than the charge. Speed
-    # follows charge, which counts do not blur; what else the rotor does is interpolated.
+    # The encoder was read at the last window of the velocity loop: a turn is older than the charge by that lag. The
+    # part of the speed that follows charge, which has no quantisation, is computed; the rest is interpolated.
     lag = 1.0 / device.velocity_rate
     moved = charge - charge.mean()
     gained = float(np.gradient(turn) @ moved) / float(moved @ moved) / CYCLE * charge
     other = turn - CYCLE * (np.cumsum(gained) - 0.5 * gained)
     turn = turn + lag * gained + lag / CYCLE * np.diff(other, append=other[-1])
-    # The supply line sags with what the stage draws; braking does not feed back.
+    # The supply line's voltage falls with the current of the stage; braking does not feed back.
     factor = 1.0 if model.brushed else 1.5
     mean_duty, mean = duty / ticks, charge / CYCLE
     drawn = np.maximum(factor * mean_duty * mean, 0.0) + SUPPLY_IDLE
@@ -311,9 +312,9 @@ def _simulate(
 
     Args:
         axis: The demand, and the integrator at the start of every millisecond.
-        start: Current there [A], shape (n,).
-        back: Back-EMF [V], likewise.
-        angle: Electrical angle [rad], likewise.
+        start: Current at the start of every millisecond [A], shape (n,).
+        back: Back-EMF there [V], shape (n,).
+        angle: Electrical angle there [rad], shape (n,).
         regulator: The current loop.
         model: The winding.
     """
@@ -336,7 +337,7 @@ def _simulate(
 
 
 class _Fit(NamedTuple):
-    mean: Floats  # R, L, K_e, volts lost to dead time, constant
+    mean: Floats  # R, L, K_e, voltage lost by dead time, constant
     spread: Floats
     freedom: int
 
@@ -347,7 +348,7 @@ class _Solved(NamedTuple):
     mean: Floats
     spread: Floats
     rest: float  # sum of squares
-    penalty: float  # what the priors say against it
+    penalty: float  # misfit to the priors
 
 
 def _fit(working: Working, window: _Window, blocks: Integers, supply: float, emf: float, saturation: float) -> _Solved:
@@ -362,17 +363,16 @@ def _fit(working: Working, window: _Window, blocks: Integers, supply: float, emf
     count = 2.0 * np.pi / working.target.motor.encoder_counts
     lost = dead_time(window.angle[:, None], window.path[:, :-1], saturation, brushed).mean(1) * CYCLE
     X = np.stack([window.charge, window.change, window.turn, lost, np.full(len(lost), CYCLE)], 1)
-    # A sample's noise is in change, the model's is not: instrument.
+    # The sampled change is noisy, the simulated one is not: it is the instrument.
     Z = X.copy()
     Z[1:, 1] = window.path[1:, -1] - window.path[:-1, -1]
-    keep = blocks > 0  # the first pulse is left out: the loop settles
+    keep = blocks > 0  # the first pulse is omitted: the loop settles
     return _solve(X[keep], Z[keep], window.flux[keep], blocks[keep], prior, deviation, count)
 
 
 def _average(results: list[_Solved], blocks: Integers) -> _Fit:
-    """Average over the saturation currents by their likelihood."""
     rest, penalty = np.array([result.rest for result in results]), np.array([result.penalty for result in results])
-    # Chi square over degrees of freedom that pulses, not milliseconds, have; and what the priors say.
+    # Chi square with the degrees of freedom of pulses instead of milliseconds, plus the misfit to the priors.
     freedom = int(blocks.max()) - 4
     misfit = freedom * rest / rest.min() + penalty
     weight = np.exp(-0.5 * (misfit - misfit.min()))
@@ -386,13 +386,13 @@ def _average(results: list[_Solved], blocks: Integers) -> _Fit:
 def _solve(
     X: Floats, Z: Floats, y: Floats, blocks: Integers, prior: Floats, deviation: Floats, count: float
 ) -> _Solved:
-    """Return coefficients, deviations for errors alike within a pulse, the rest's square, and the priors' misfit."""
+    """Return coefficients, deviations for errors equal within a pulse, squared residuals, and the priors' misfit."""
     scale = np.maximum(np.sqrt(np.mean(X**2, axis=0)), 1e-15)
     A, B = X / scale, Z / scale
     weight = np.zeros(X.shape[1])
     b, variance, floor = np.zeros(X.shape[1]), 0.0, float(np.mean((LEAST_NOISE * y) ** 2))
     known = np.isfinite(deviation)
-    # Turns are differences of counts, whose rounding would make K_e small: its known variance is taken out.
+    # Turns are differences of counts, whose rounding would bias K_e: its known variance is subtracted.
     blur = np.zeros(X.shape[1])
     blur[TURN] = min(len(y) * count**2 / 12.0 / scale[TURN] ** 2, 0.5 * float(A[:, TURN] @ A[:, TURN]))
     for _ in range(3):
@@ -439,7 +439,7 @@ def _none(reason: str) -> Winding:
 
 
 def to_torque_mode(working: Working, holding: Floats) -> None:
-    """Go from a velocity mode to cst, with the currents that hold the axes [A]."""
+    """Change from a velocity mode to cst, with the currents that hold the axes [A]."""
     drives = working.target.drives
     drives.write(cia402.TARGET_TORQUE, to_counts(drives, holding), where=working.where)
     motion.select_mode(drives, "cst", working.where)

@@ -1,7 +1,7 @@
-"""How a motor's cable is wired, as the field shows it, and the settings with which a drive makes up for that.
+"""The wiring of a motor's cable as measured with a turning field, and the settings of a drive that compensate for it.
 
-The field turns in open loop and takes the rotor along; the signals of encoder and halls then show how they are wired.
-One object makes up for a reversed encoder, one for halls of inverted level, one for halls in reverse order.
+The field turns in open loop and moves the rotor; the signals of encoder and halls then show how they are wired. One
+object compensates for a reversed encoder, one for halls with inverted level, one for halls in reverse order.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from tuning.target import Target
 
 
-# What is wrong with a cable where the drive is set otherwise than it is wired.
+# Description of a wiring that differs from the drive's setting.
 FINDINGS = {
     Role.ENCODER_DIRECTION: "encoder reversed",
     Role.HALL_POLARITY: "hall levels inverted",
@@ -31,13 +31,13 @@ FINDINGS = {
 }
 SETTLED = 0.002  # s after which a position is read in the new direction
 
-LEAST_HALL_TURN = 2.6  # electrical rad of the field: two edges at least, from wherever it begins
-HALL_SLACK = 0.5  # by which their way may differ from the field's: a sector of three
-CLEAR = np.radians(60.0)  # of what their angle is off: beyond half a sector and what friction holds the rotor back
+LEAST_HALL_TURN = 2.6  # electrical rad of the field: at least two edges, from any start
+HALL_SLACK = 0.5  # greatest relative difference between the turns of halls and field: one sector of three
+CLEAR = np.radians(60.0)  # of their angle's error: beyond half a sector plus the effect of friction on the rotor
 
 
 class Halls(NamedTuple):
-    """The halls of one axis: whether they count against the field, and stand opposite to it; None unknown."""
+    """The halls of one axis: whether they count against the field, and are opposite to it; None if unknown."""
 
     reversed: bool | None = None
     inverted: bool | None = None
@@ -45,7 +45,7 @@ class Halls(NamedTuple):
 
 
 class Setting(NamedTuple):
-    """An object's value, and the one that the wiring needs."""
+    """An object's present value, and the one that the wiring needs."""
 
     has: int
     needs: int
@@ -55,7 +55,7 @@ Settings = Mapping[Key, Setting]
 
 
 def findings(device: Device) -> dict[Key, str]:
-    """Return the possible mistakes in wiring, by the object that compensates each, as far as the device has them."""
+    """Return the possible wiring errors of a device, by the object that compensates each."""
     return {device.roles[role]: text for role, text in FINDINGS.items() if role in device.roles}
 
 
@@ -83,9 +83,9 @@ def needed(device: Device, reads: Mapping[Key, int], encoder: float, halls: Hall
 
     Args:
         device: The drive.
-        reads: The objects as they are.
-        encoder: 1 where the encoder counts with the field, -1 against it, nan where it is not known.
-        halls: What they say.
+        reads: Present values of the objects.
+        encoder: 1 if the encoder counts with the field, -1 if against it, nan if unknown.
+        halls: Result of `judge_halls`.
     """
     found = {
         Role.ENCODER_DIRECTION: None if np.isnan(encoder) else encoder < 0.0,
@@ -97,37 +97,37 @@ def needed(device: Device, reads: Mapping[Key, int], encoder: float, halls: Hall
 
 
 def changes(settings: Settings) -> dict[Key, int]:
-    """Return the values to write."""
+    """Return the values to write by object; empty if all are correct."""
     return {key: one.needs for key, one in settings.items() if one.has != one.needs}
 
 
 def finding(device: Device, settings: Settings) -> list[str]:
-    """Return the mistake in words, with the remedy: "encoder reversed: write 2080h:01 = 1"."""
+    """Describe the wiring errors with their remedy: "encoder reversed: write 2080h:01 = 1"."""
     return [f"{findings(device)[key]}: write {named(key)} = {value}" for key, value in changes(settings).items()]
 
 
 def corrected(device: Device, settings: Settings) -> list[str]:
-    """Return the corrected mistake in words: "encoder reversed: 2080h:01 is 1 now, and was 0"."""
+    """Describe the corrected wiring errors: "encoder reversed: 2080h:01 is 1 now, and was 0"."""
     wrong = changes(settings)
     what = findings(device)
     return [f"{what[key]}: {named(key)} is {wrong[key]} now, and was {settings[key].has}" for key in wrong]
 
 
 def named(key: Key) -> str:
-    """Return an object as the manual writes it."""
+    """Format an object like the manual does."""
     return f"{key[0]:04X}h:{key[1]:02d}"
 
 
 def write_wiring(target: Target, origin: Integers, values: Sequence[Mapping[Key, int]]) -> tuple[Target, Integers]:
-    """Write settings of axes that are off, and return the target and where its rotors had begun [inc], as then counted.
+    """Write wiring settings of axes that are off; return the target and its rotors' origin [inc] in the new counting.
 
-    A drive that counts the other way shows another position where the rotor is, and it is unknown whether a travel was
-    meant in the old direction or in the new: what is left is free to both sides.
+    A drive that counts in the other direction shows another position at the same place, and it is unknown in which
+        direction a travel was meant: only what is free to both sides remains.
 
     Args:
         target: The axes.
-        origin: Their positions where the travel was given.
-        values: What to write, by object, of every axis.
+        origin: Their positions when the travel was given.
+        values: Values to write, by object, for every axis.
     """
     if not any(values):
         return target, origin
@@ -144,7 +144,7 @@ def write_wiring(target: Target, origin: Integers, values: Sequence[Mapping[Key,
     gone = wrapped(before - origin)
     now = wrapped(drives.read(cia402.POSITION_ACTUAL) + gone)
     free = np.minimum(-target.low, target.high)
-    # A place to either side, so that the travel still holds where the rotor stands.
+    # Extended to both sides, so that the travel still contains the present position.
     here = np.abs(gone) / increments
     room = np.where(turned, np.maximum(free, here), np.inf)
     narrowed = replace(target, low=np.maximum(target.low, -room), high=np.minimum(target.high, room))

@@ -1,7 +1,7 @@
-"""Drives while they are experimented on: cautious settings of our own, the old ones given back at the end.
+"""Drives during experiments: cautious settings, with the old ones restored at the end.
 
-A drive may come factory-fresh, with all gains 0, or with gains that make it shake: before anything turns, it gets gains
-from the data sheet that are slow enough for any load, and the profile, limits and windows that the experiments need.
+A drive may have factory settings, with all gains 0, or gains with which it oscillates: before anything turns, it gets
+gains from the data sheet that are slow enough for any load, and profile, limits and windows for the experiments.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ if TYPE_CHECKING:
     from drive_env.devices import Device
 
 
-BOTH_ENDS = 3  # bits of 60FDh, and the value of 2005h with which neither limit switch counts
-STOP_MODE = 1 << 8  # of 2101h: enabled, in no mode yet, since the encoder is aligned
+BOTH_ENDS = 3  # bits of 60FDh, and the value of 2005h that disables both limit switches
+STOP_MODE = 1 << 8  # of 2101h: enabled, but not in a mode yet, since the encoder is being aligned
 
 
 def borrowed(device: Device) -> tuple[ObjectName, ...]:
-    """Return the objects that experiments change, in the order of giving them back, as far as the device has them."""
+    """Return the objects of a device that experiments change, in the order of restoring."""
     names: tuple[ObjectName, ...] = (
     Role.CURRENT_LIMIT, Role.CURRENT_LIMIT_NEGATIVE, Role.OPEN_LOOP_CURRENT, *device.gains.keys, Role.MOTOR_TYPE,
     Role.COMMUTATION, Role.POLE_PAIRS, Role.ENCODER_STEPS, *FINDINGS,
@@ -51,9 +51,9 @@ def borrowed(device: Device) -> tuple[ObjectName, ...]:
 
 
 def read_role(target: Target, role: Role) -> Integers:
-    """Return an object by its role, shape (num_axes,); 0 if the drive lacks it, which is as if it were unused.
+    """Read an object by its role, shape (num_axes,); 0 if the drive lacks it, which means unused.
 
-    So a drive without a setting of the shaft's direction turns it nowhere, and one without flags aligns no encoder.
+    A drive without a setting of the shaft's direction does not reverse it, and one without flags aligns no encoder.
     """
     return target.drives.read(role) if role in target.device.roles else np.zeros(target.num_axes, np.int64)
 
@@ -62,14 +62,14 @@ BRUSHED, BRUSHLESS = 1, 3  # 2050h
 BY_FIELD, BY_HALLS, BY_ENCODER = 1, 2, 3  # 2055h
 ALIGNED_BY_HALLS = 2  # 2080h:03
 
-CURRENT_HZ, VELOCITY_HZ, POSITION_HZ = 300.0, 20.0, 5.0  # cautious bandwidths, of data sheet values
+CURRENT_HZ, VELOCITY_HZ, POSITION_HZ = 300.0, 20.0, 5.0  # cautious bandwidths, computed from data sheet values
 INTEGRATION = 5.0  # T_i as a multiple of 1/w_v
-# Above its resonance an elastic load leaves the rotor alone, whose crossover then is what P makes of its inertia.
+# Above its resonance an elastic load decouples from the rotor, whose inertia and P then determine the crossover.
 ROTOR_HZ = 100.0
-BASE_MARGIN, BASE_SHARE = 0.5, 0.4  # rad from the ends of the travel, or of the travel if that is less
-RETURN_SPEED, REST = 0.1, 60  # of the speed limit, on the way back; cycles at rest there
-GUESS = 3.0  # total inertia over the rotor's, until it is known
-ENABLE_TIME, ALIGNMENT_TIME = 1.0, 8.0  # s, longest waits: for the states, and for an encoder that is aligned first
+BASE_MARGIN, BASE_SHARE = 0.5, 0.4  # rad from the ends of the travel, or share of the travel if that is less
+RETURN_SPEED, REST = 0.1, 60  # of the speed limit, on the way back; cycles at rest afterwards
+GUESS = 3.0  # assumed total inertia over the rotor's, until it is identified
+ENABLE_TIME, ALIGNMENT_TIME = 1.0, 8.0  # s, longest waits: for the states, and for an encoder that is first aligned
 
 
 @dataclass
@@ -77,12 +77,13 @@ class Working:
     """Drives in their working state.
 
     Attributes:
-        target: What is identified.
-        where: Axes that are experimented on.
-        origin: Position of every axis when the target was made known [inc].
+        target: The target to identify.
+        where: Axes under experiment.
+        origin: Position of every axis at the beginning of the experiments [inc].
         increments: Position increments per radian.
-        current: Most that may be asked for [A], of every axis: the target's limit, or the drive's own if that is lower.
-        fresh: Axes whose drives knew no motor.
+        current: Greatest current that may be commanded to every axis [A]: the target's limit, or the drive's own if
+            lower.
+        fresh: Axes whose drives were factory-fresh (motor type 0).
     """
 
     target: Target
@@ -94,7 +95,7 @@ class Working:
 
     @property
     def base(self) -> Floats:
-        """Return where experiments begin and end [rad from the origin]: there, or a little inside of a near limit."""
+        """Angles at which experiments begin and end [rad from the origin]: 0, or a little inside a near limit."""
         low, high = self.target.low, self.target.high
         margin = np.minimum(BASE_MARGIN, BASE_SHARE * (high - low))
         return np.clip(np.zeros(len(low)), low + margin, high - margin)
@@ -109,7 +110,7 @@ class Working:
         return np.asarray(self.increments * per_increment(self.target.drives, cia402.VELOCITY_ACTUAL))
 
     def room(self) -> tuple[Floats, Floats]:
-        """Return how far the rotors may turn from where they are now [rad], down and up."""
+        """Return the signed angles that the rotors may turn from here [rad], down and up."""
         here = self.angle(self.target.drives.read(cia402.POSITION_ACTUAL))
         return self.target.low - here, self.target.high - here
 
@@ -128,16 +129,16 @@ def cautious_gains(target: Target, inertia: ArrayLike) -> Integers:
 
 
 def cautious_bandwidth(motor: Motor, inertia: float, wanted: float = VELOCITY_HZ) -> float:
-    """Return the bandwidth of a velocity loop [Hz] that is stable on the whole inertia and on the rotor alone."""
+    """Return the bandwidth of a velocity loop [Hz] that is stable with the whole inertia and with the rotor alone."""
     return min(wanted, ROTOR_HZ * motor.inertia / inertia)
 
 
 @contextmanager
 def working_state(target: Target, where: Mask | None = None) -> Iterator[Working]:
-    """Give drives that are commissioned, cautious and off; afterwards they are off and have their own settings.
+    """Yield drives that are commissioned, cautious and off; restore their settings at the end and switch them off.
 
     Raises:
-        RuntimeError: If a drive is enabled, moves, or does not take what it must.
+        RuntimeError: If a drive is enabled, moves, or refuses a setting.
     """
     drives = target.drives
     axes = np.ones(target.num_axes, bool) if where is None else where
@@ -158,21 +159,21 @@ def _prepare(target: Target, axes: Mask, before: Mapping[Any, Integers]) -> Work
     drives, motor = target.drives, target.motor
     increments = target.increments()
     write_gains(drives, cautious_gains(target, GUESS * motor.inertia), axes)
-    # A drive fresh from the factory knows no motor; one that is commissioned is taken at its word and checked.
+    # A factory-fresh drive has no motor data; the data of a commissioned one are used and checked.
     fresh = axes & (before[Role.MOTOR_TYPE] == 0)
     if fresh.any():
         drives.write(Role.MOTOR_TYPE, BRUSHED if motor.kind == "dc" else BRUSHLESS, where=fresh)
         drives.write(Role.POLE_PAIRS, motor.n_p, where=fresh)
         drives.write(Role.ENCODER_STEPS, motor.encoder_counts, where=fresh)
         drives.write(Role.COMMUTATION, BY_ENCODER, where=fresh)
-        # No axis is at both ends: switches that say so are not there.
+        # No axis can be at both ends: the switches are not connected.
         unwired = fresh & (drives.read(cia402.DIGITAL_INPUTS) & BOTH_ENDS == BOTH_ENDS)
         if Role.LIMIT_SWITCHES in target.device.roles:
             drives.write(Role.LIMIT_SWITCHES, BOTH_ENDS, where=unwired)
     own = read_current_limit(drives)
     current = np.where(own > 0.0, np.minimum(own, target.current), target.current)
     write_current_limit(drives, current, axes)
-    # A limit may count more coarsely than torques do: what is asked for stays within it, also as whole counts of 6071h.
+    # A limit may have coarser units than torques: commanded currents stay within it also when rounded to 6071h.
     limit = read_current_limit(drives)
     counts, ampere = to_counts(drives, limit), ampere_per_count(drives)
     limit = np.where(counts * ampere > limit * (1.0 + 1e-9), (counts - 1) * ampere, limit)
@@ -180,7 +181,7 @@ def _prepare(target: Target, axes: Mask, before: Mapping[Any, Integers]) -> Work
     scale = increments
     for ramp in (cia402.PROFILE_ACCELERATION, cia402.PROFILE_DECELERATION, cia402.QUICK_STOP_DECELERATION):
         drives.write(ramp, _raw(10.0 * target.speed * scale * per_increment(drives, ramp)), where=axes)
-    # Slow loops lag by turns: what the experiments allow is watched by them, not by this window.
+    # Slow loops may lag by turns: the experiments check their own limits, so this window is wide.
     drives.write(cia402.FOLLOWING_WINDOW, _raw(200.0 * math.pi * scale), where=axes)
     drives.write((cia402.INTERPOLATION_PERIOD, 1), 1, where=axes)
     drives.write((cia402.INTERPOLATION_PERIOD, 2), -3, where=axes)
@@ -200,10 +201,10 @@ def _give_back(target: Target, axes: Mask, before: Mapping[Any, Integers], mode:
 
 
 def enable(working: Working, mode: str, where: Mask | None = None) -> None:
-    """Enable axes in a cyclic mode, at rest until told otherwise.
+    """Enable axes in a cyclic mode with set-points of 0.
 
     Raises:
-        RuntimeError: If an axis does not come up.
+        RuntimeError: If an axis is not enabled in time.
     """
     drives = working.target.drives
     axes = working.where if where is None else where
@@ -213,7 +214,7 @@ def enable(working: Working, mode: str, where: Mask | None = None) -> None:
         motion.enable(drives, mode=mode, where=axes, timeout=ENABLE_TIME)
         waited = 0.0
         aligns = axes & (drives.read(Role.COMMUTATION) == BY_ENCODER) & (drives.read(Role.MOTOR_TYPE) == BRUSHLESS)
-        if aligns.any():  # the flags are those of the millisecond before; and what was switched on comes to rest
+        if aligns.any():  # the flags are one millisecond old; and the rotor must come to rest
             drives.advance(50 * CYCLE)
             waited += 50 * CYCLE
         while waited < ALIGNMENT_TIME and np.any(aligns & is_aligning(working.target)):
@@ -225,17 +226,17 @@ def enable(working: Working, mode: str, where: Mask | None = None) -> None:
 
 
 def is_aligning(target: Target) -> Mask:
-    """Return which axes are enabled and turn to where their encoder is aligned, before they do anything else."""
+    """Return which axes are enabled but still turn to align their encoder."""
     return np.asarray(read_role(target, Role.MOTOR_FLAGS) & STOP_MODE != 0)
 
 
 def go_back(working: Working, mode: str, to: ArrayLike | None = None) -> None:
-    """Bring axes that are enabled back to their base, or to an angle [rad], in csp, and go on in a mode, at rest."""
+    """Bring enabled axes to their base, or to an angle [rad], in csp, and change to a mode at rest."""
     target, drives = working.target, working.target.drives
     motion.select_mode(drives, "csp", working.where)
     goal = working.base if to is None else np.asarray(to, float)
     here = working.angle(drives.read(cia402.POSITION_ACTUAL)) - goal
-    # As slow as the axis farthest away needs it: the path's peak is twice its mean.
+    # The axis farthest away determines the time: the path's peak speed is twice its mean.
     cycles = int(
         np.clip(np.ceil(2.0 * np.abs(here[working.where]).max() / (RETURN_SPEED * target.speed) / CYCLE), 60, 2000)
     )
@@ -248,13 +249,13 @@ def go_back(working: Working, mode: str, to: ArrayLike | None = None) -> None:
 
 
 def switch_off(drives: Drives, where: Mask) -> None:
-    """Switch axes off; one in fault is off already, and its fault stays, to be read and reset by the caller."""
+    """Switch axes off; one in fault is already off, and its fault remains for the caller to read and reset."""
     fault = cia402.matches(drives.read(cia402.STATUSWORD), cia402.FAULT_BIT)
     motion.disable(drives, where & ~fault)
 
 
 def still_enabled(working: Working, status: Integers) -> Mask:
-    """Return which axes are in operation enabled by their statuswords."""
+    """Return which axes are in "operation enabled" by their statuswords."""
     return np.asarray(cia402.matches(status, cia402.OPERATION_ENABLED))
 
 

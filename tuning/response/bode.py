@@ -1,4 +1,4 @@
-"""Pictures of measured open loops: Bode with coherence, and Nyquist. Incoherent lines are grey, and not joined."""
+"""Pictures of measured open loops: Bode diagram with coherence, and Nyquist diagram. Incoherent lines are grey dots."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ if TYPE_CHECKING:
 
 
 MEASURED, TRACED, MODEL, GREY = "#0b5cad", "#c2560c", "#222222", "#b5b5b5"
-PHASES = (-270.0, 90.0)  # degrees shown: about -180, and an anti-resonance, which leads, does not wrap
+PHASES = (-270.0, 90.0)  # degrees shown: an anti-resonance, which adds phase, must not wrap near -180 degrees
 _FINE = 600
 _TICKS = (1, 2, 5, 10, 20, 50, 100, 200, 400, 1000)  # Hz
 
 
 def bode_figure(response: MeasuredLoop, axis: int = 0) -> Figure:
-    """Return magnitude, phase and coherence of an axis over frequency, and the Nyquist curve around -1.
+    """Draw magnitude, phase and coherence of an axis over frequency, and the Nyquist curve around -1.
 
-    The loop that the linear model computes of the fitted plant with the same gains is drawn beside what was measured.
+    The loop computed from the fitted plant with the same gains is drawn for comparison.
     """
     from matplotlib.figure import Figure
     from matplotlib.ticker import NullFormatter, ScalarFormatter
@@ -53,7 +53,7 @@ def bode_figure(response: MeasuredLoop, axis: int = 0) -> Figure:
 
 
 def write_bode(path: Path, response: MeasuredLoop, axis: int = 0) -> None:
-    """Write `bode_figure` to a file; its ending decides the format: .png, .svg, .pdf."""
+    """Write `bode_figure` to a file; its suffix selects the format: .png, .svg, .pdf."""
     write_picture(path, bode_figure(response, axis), 120)
 
 
@@ -66,14 +66,14 @@ def _model(response: MeasuredLoop, axis: int, plant: Plant | None) -> tuple[Floa
 
 
 def within_a_turn(phase: np.ndarray) -> np.ndarray:
-    """Return phases [degrees] within PHASES: -540 degrees is as near to instability as -180 degrees."""
+    """Wrap phases [degrees] into PHASES: -540 degrees is as close to instability as -180 degrees."""
     return np.asarray((phase - PHASES[0]) % 360.0 + PHASES[0])
 
 
 def draw_margins(
     magnitude: Axes, phase: Axes, phase_hz: float, phase_deg: float, gain_hz: float, gain_db: float, color: str
 ) -> None:
-    """Draw the phase margin from -180 degrees and the gain margin from 0 dB, each where it was measured."""
+    """Draw the phase margin from -180 degrees and the gain margin from 0 dB, each at its frequency."""
     for axes, at, line, size in ((phase, phase_hz, -180.0, phase_deg), (magnitude, gain_hz, 0.0, -gain_db)):
         if np.isfinite(at) and np.isfinite(size):
             axes.plot([at, at], [line, line + size], color=color, linewidth=2.2, marker="_", solid_capstyle="butt")
@@ -145,7 +145,7 @@ def _draw_nyquist(plot: Any, response: MeasuredLoop, axis: int, plant: Plant | N
     circle = np.exp(2j * np.pi * np.linspace(0.0, 1.0, 200))
     plot.plot(circle.real, circle.imag, color="k", linewidth=0.4, linestyle=":")
     if np.isfinite(ms):
-        # The curve touches this circle where it comes nearest to -1.
+        # The curve touches this circle at its point nearest to -1.
         plot.plot(-1.0 + circle.real / ms, circle.imag / ms, color="#a01030", linewidth=0.7)
         plot.annotate(f"1/Ms = {1.0 / ms:.2f}", (-1.0, 1.0 / ms), fontsize=8, color="#a01030", ha="center", va="bottom")
     plot.plot(-1.0, 0.0, "+", color="#a01030", markersize=9)
@@ -171,12 +171,12 @@ def _text(value: float, form: str) -> str:
 
 
 def _turns(L: Complex) -> Floats:
-    """Return the phase in degrees, as it is shown."""
+    """Return the displayed phase in degrees."""
     return within_a_turn(np.degrees(np.angle(L)))
 
 
 def _without_jumps(f: Floats, value: Floats) -> tuple[Floats, Floats]:
-    """Return a line that is broken where a phase wraps."""
+    """Break a line where its phase wraps, by inserting nan."""
     jumps = np.flatnonzero(np.abs(np.diff(value)) > 180.0) + 1
     return np.insert(f, jumps, np.nan), np.insert(value, jumps, np.nan)
 

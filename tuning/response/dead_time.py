@@ -1,7 +1,7 @@
-"""The voltage lost by the bridge's dead time, which follows the current's sign.
+"""The voltage lost by the bridge's dead time; its sign is that of the current.
 
-While both switches of a leg are off the current chooses the rail. Below the current that charges the switches within
-the dead time the loss fades, so that to a small current it looks like resistance.
+While both switches of a leg are off the current selects the rail. Below the current that charges the switches within
+the dead time the loss decreases, so that for small currents it acts like a resistance.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ if TYPE_CHECKING:
 
 
 SQRT3 = 3.0**0.5
-ANGLES = 24  # of a turn, over which a resistance is averaged
-STEP = 1e-3  # of the saturating current, of a difference quotient
+ANGLES = 24  # per turn, over which a resistance is averaged
+STEP = 1e-3  # of the saturating current, for a difference quotient
 
 
 def dead_time(angle: Floats, i_q: Floats, saturation: float, brushed: bool) -> Floats:
-    """Return the voltage along q that dead time takes, over the greatest loss of one phase.
+    """Return the voltage along q lost by dead time, over the greatest loss of one phase.
 
     Args:
         angle: Electrical angle [rad].
         i_q: Current [A]; i_d is 0.
-        saturation: Current from which a phase loses all of it [A].
-        brushed: Whether the motor lies between two legs.
+        saturation: Current from which a phase has the greatest loss [A].
+        brushed: Whether the motor is connected between two legs.
     """
     if brushed:
         return np.asarray(2.0 * np.clip(i_q / saturation, -1.0, 1.0))
@@ -42,7 +42,7 @@ def dead_time(angle: Floats, i_q: Floats, saturation: float, brushed: bool) -> F
 
 
 def dead_time_resistance(device: Device, motor: Motor, supply: float, current: Floats) -> float:
-    """Return the resistance [ohm] that dead time in the middle of its range looks like to a swing of the current.
+    """Return the resistance [ohm] by which dead time in the middle of its range acts on a change of the current.
 
     Args:
         device: The drive.

@@ -1,6 +1,6 @@
-"""Excitations of an axis: multisines and periodic chirps of given amplitudes, and their dimensioning.
+"""Excitations of an axis: multisines and periodic chirps with given amplitudes, and the choice of these amplitudes.
 
-Both repeat exactly, so that every period holds the same lines and whatever differs between periods is noise.
+Both repeat exactly, so that every period contains the same lines, and differences between periods are noise.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from scipy import signal
 from mechanics.arrays import Complex, Floats, Integers
 
 KINDS = ("multisine", "chirp")
-CREST = 2.5  # peak over RMS that is counted with before the wave is known
+CREST = 2.5  # assumed peak over RMS until the wave is computed
 
-LEAST_SHARE = 0.4  # current of the lines in the middle over that of the highest
-STIFF = (0.8, 3.0)  # bounds of what is added or taken where an axis moves little or much
-LOW = 25.0  # Hz; few lines lie below, where cogging and friction disturb: they get as much as the highest
+LEAST_SHARE = 0.4  # current of the middle lines over that of the highest
+STIFF = (0.8, 3.0)  # limits of the factor on lines at which an axis moves little or much
+LOW = 25.0  # Hz; the few lines below get as much current as the highest, because of cogging and friction
 
 
 class Lines(NamedTuple):
@@ -30,7 +30,7 @@ class Lines(NamedTuple):
 
     @property
     def bins(self) -> Integers:
-        """Which bins of a period's Fourier transform the lines are."""
+        """Bins of the lines in the Fourier transform of a period."""
         return np.rint(self.f * self.samples / self.rate).astype(np.int64)
 
 
@@ -38,7 +38,7 @@ def plan_lines(low: float, high: float, resolution: float, rate: float) -> Lines
     """Return the multiples of the resolution from `low` to `high` [Hz].
 
     Raises:
-        ValueError: If no whole number of samples makes a period, or the range is empty or too high.
+        ValueError: If a period is not a whole number of samples, or the range is empty or too high.
     """
     if not 0.0 < resolution <= low < high:
         raise ValueError(
@@ -60,10 +60,10 @@ def periodic(kind: str, lines: Lines, amplitude: Floats) -> Floats:
     Args:
         kind: "multisine" or "chirp".
         lines: Its frequencies.
-        amplitude: Of each line, shape (n, axes).
+        amplitude: Amplitude of each line, shape (n, axes).
 
     Raises:
-        ValueError: For another kind.
+        ValueError: For an unknown kind.
     """
     if kind not in KINDS:
         raise ValueError(f"no excitation is named {kind!r}; there are {', '.join(KINDS)}")
@@ -71,7 +71,7 @@ def periodic(kind: str, lines: Lines, amplitude: Floats) -> Floats:
 
 
 def _multisine(lines: Lines, amplitude: Floats) -> Floats:
-    """Phases after Schroeder (1970, doi:10.1109/TIT.1970.1054411): each line has its share of the period."""
+    """Return a multisine with Schroeder's phases (1970, doi:10.1109/TIT.1970.1054411), by the power of the lines."""
     power = amplitude**2 / np.maximum((amplitude**2).sum(axis=0), np.finfo(float).tiny)
     before = np.cumsum(np.cumsum(power, axis=0), axis=0) - np.cumsum(power, axis=0)
     spectrum = np.zeros((lines.samples // 2 + 1, amplitude.shape[1]), complex)
@@ -80,7 +80,7 @@ def _multisine(lines: Lines, amplitude: Floats) -> Floats:
 
 
 def _chirp(lines: Lines, amplitude: Floats) -> Floats:
-    """A linear sweep has its line's whole amplitude for that line's share of the period."""
+    """Return a linear sweep, which has each line's whole amplitude during the line's share of the period."""
     t = np.arange(lines.samples) / lines.rate
     period = lines.samples / lines.rate
     sweep = signal.chirp(t, lines.f[0], period, lines.f[-1], phi=-90.0)
@@ -91,40 +91,40 @@ def _chirp(lines: Lines, amplitude: Floats) -> Floats:
 
 
 def peak(kind: str, lines: Lines, amplitude: Floats, response: Complex) -> Floats:
-    """Return the peak of a response to an excitation at its lines, complex (n, axes); shape (axes,)."""
+    """Return the peak of the response to an excitation, (axes,); `response` at its lines is complex, (n, axes)."""
     spectrum = np.fft.rfft(periodic(kind, lines, amplitude), axis=0)
     answer = np.zeros_like(spectrum)
     answer[lines.bins] = spectrum[lines.bins] * response
-    # Between the samples, too.
+    # Interpolated, to find peaks between the samples.
     return np.asarray(4.0 * np.abs(np.fft.irfft(answer, 4 * lines.samples, axis=0)).max(axis=0))
 
 
 def dimension(
     lines: Lines, current: Floats, velocity: Floats, largest_current: Floats, largest_velocity: Floats
 ) -> Floats:
-    """Return amplitudes of the set-point that make the most of an axis's limits, shape (n, axes).
+    """Return the greatest amplitudes of the set-point within an axis' limits, shape (n, axes).
 
-    The current rises with the frequency, since what it moves falls and the encoder's noise rises with it, and towards
-    the lowest lines, and where the axis hardly moves; where the velocity would be too large, its largest lines are cut
-    to one level.
+    The current increases with frequency, since the motion decreases and the encoder's noise increases; it also
+    increases towards the lowest lines, and where the axis hardly moves. If the velocity would be too large, its largest
+    lines are limited to one level.
 
     Args:
         lines: The frequencies.
         current: Gain from set-point to current of each line [A per unit], shape (n, axes).
-        velocity: Gain from set-point to velocity [rad/s per unit], likewise.
-        largest_current: Peak [A], shape (axes,).
-        largest_velocity: Peak [rad/s], shape (axes,).
+        velocity: Gain from set-point to velocity of each line [rad/s per unit], shape (n, axes).
+        largest_current: Greatest peak of the current [A], shape (axes,).
+        largest_velocity: Greatest peak of the velocity [rad/s], shape (axes,).
     """
     share = np.maximum(np.maximum(lines.f / lines.f[-1], LEAST_SHARE), np.minimum(LOW / lines.f, 1.0))
     tiny = np.finfo(float).tiny
-    # What an axis takes to move, over that of a rigid one: much at an anti-resonance, little at a resonance.
+    # Current per motion over that of a rigid axis: large at an anti-resonance, small at a resonance.
     stiff = current / np.maximum(velocity * lines.f[:, None], tiny)
     stiff = np.sqrt(stiff / np.maximum(np.median(stiff, axis=0), tiny))
     shares = share[:, None] * np.clip(stiff, *STIFF)
     shares /= np.sqrt(0.5 * (shares**2).sum(axis=0))  # for an RMS of 1
     amplitude = largest_current / CREST * shares / np.maximum(current, tiny)
     speeds = amplitude * velocity
-    allowed = 2.0 * (largest_velocity / CREST) ** 2  # sum of squares
+    allowed = 2.0 * (largest_velocity / CREST) ** 2  # limit of the sum of squares
     low, high = np.zeros(speeds.shape[1]), speeds.max(axis=0)
     for _ in range(50):
         level = 0.5 * (low + high)

@@ -1,8 +1,8 @@
-"""Excites axes that run at a steady speed, there and back, and returns excitation and response.
+"""Excites axes that move at a steady speed in both directions, and returns excitation and response.
 
-Dry friction is a constant while an axis keeps its direction: so the excitation rides on a speed that is larger than
-its own, within the travel. The excitation goes on through the reversal and repeats exactly; what is looked at begins
-when the reversal has died away.
+Dry friction is constant while an axis does not change direction: so the excitation is added to a steady speed larger
+than its own, within the travel. It continues through the reversal and repeats exactly; the evaluated samples begin when
+the effects of the reversal have decayed.
 """
 
 from __future__ import annotations
@@ -30,28 +30,28 @@ SET_POINT = {"velocity": (cia402.TARGET_VELOCITY, 0), "position": (cia402.TARGET
 OFFSET = {
     "velocity": (cia402.VELOCITY_OFFSET, 0),
     "position": (cia402.POSITION_OFFSET, 0),
-}  # what the drive adds to the set-point
+}  # added to the set-point by the drive
 SEEN = {"velocity": cia402.VELOCITY_ACTUAL, "position": cia402.POSITION_ACTUAL}
 MODE = {"velocity": "csv", "position": "csp"}
 INTERPOLATION = ((cia402.INTERPOLATION_PERIOD, 1), (cia402.INTERPOLATION_PERIOD, 2))
-RAMP, SETTLING = 30, 70  # cycles: of a change of speed, and until what it left has died away
+RAMP, SETTLING = 30, 70  # cycles: of a change of speed, and until its effects have decayed
 FADE = 20  # cycles
-IN_RAMPS = 0.3  # share of the shaking while the speed changes
-LOOK = 20  # cycles at rest, in which is seen what holds an axis
-REST, RETURN = 30, 50  # cycles in which an axis comes to rest, and goes back, or more where that would be too fast
-BACK = 0.8  # of the way back: an axis that overshoots must not leave its travel
-SETTLED = 200  # cycles until what was let go stands where the others have left it
-NEAR = 0.02  # rad from where it began at which an axis stays
+IN_RAMPS = 0.3  # share of the excitation while the speed changes
+LOOK = 20  # cycles at rest over which the holding current is averaged
+REST, RETURN = 30, 50  # cycles until an axis is at rest, and of its return; more if that would be too fast
+BACK = 0.8  # of the return: an axis that overshoots must not leave its travel
+SETTLED = 200  # cycles until axes that were switched off are at rest
+NEAR = 0.02  # rad from the first position, within which an axis does not return
 
 
 class Pass(NamedTuple):
-    """The samples of a run while its speed was steady; periods one after the other, SI.
+    """The samples of a run at steady speed; periods one after the other, in SI units.
 
-    set_point: As played, less the steady motion, shape (periods * samples, axes).
-    answer: As seen on the bus, likewise.
-    current: 6077h [A], likewise.
-    fast_set_point, fast_answer: The same at the velocity loop's rate, of a trace; empty without one.
-    peak_current: 6077h at its highest, ramps included [A], shape (axes,).
+    set_point: Played set-point less the steady motion, shape (periods * samples, axes).
+    answer: Response as sampled on the bus, same shape.
+    current: 6077h [A], same shape.
+    fast_set_point, fast_answer: The same at the velocity loop's rate, from a trace; empty without one.
+    peak_current: Greatest 6077h, also during ramps [A], shape (axes,).
     enabled: Whether the axis was enabled all the time, shape (axes,).
     """
 
@@ -65,12 +65,12 @@ class Pass(NamedTuple):
 
 
 class Shaker:
-    """Runs excitations on the axes of a target; a context that leaves states and modes, where there was one, as found.
+    """Runs excitations on the axes of a target; as a context it restores states and modes, without an error.
 
     Args:
         target: The axes.
         loop: "velocity" (csv) or "position" (csp).
-        where: Axes that are shaken, shape (num_axes,).
+        where: Axes to excite, shape (num_axes,).
         lines: Frequencies.
         kind: "multisine" or "chirp".
     """
@@ -79,20 +79,20 @@ class Shaker:
         self._target, self._drives, self._loop, self._where = target, target.drives, loop, where
         self._lines, self._kind = lines, kind
         self.radians = 2.0 * math.pi / np.maximum(np.asarray(self._drives.read(Role.POSITION_SCALE), float), 1.0)
-        # Of a count of the loop's set-point.
+        # Per count of the loop's set-point.
         self.per_count = self.radians / per_increment(self._drives, SEEN[loop])
-        self.traced_time = 0.0  # s that passed in traces, which a target's clock does not see
-        self.fastest = np.full(target.num_axes, 0.4 * target.speed)  # on the way back [rad/s]
+        self.traced_time = 0.0  # s that passed in traces, which the target's clock does not count
+        self.fastest = np.full(target.num_axes, 0.4 * target.speed)  # rad/s, greatest speed on the way back
 
     def __enter__(self) -> Shaker:
         drives, where = self._drives, self._where
         self._were_on = _enabled(drives)
         self._modes = drives.read(cia402.MODE)
         self._interpolation = [drives.read(name) for name in INTERPOLATION]
-        # A set-point is reached within a millisecond, which is when the next comes.
+        # Interpolation of 1 ms: a set-point is reached when the next one comes.
         for name, value in zip(INTERPOLATION, (1, -3), strict=True):
             drives.write(name, value, where=where)
-        # A drive without such an object adds nothing.
+        # A drive without this object adds no offset.
         has_offset = OFFSET[self._loop] in self._target.device.bindings
         self._offset = np.asarray(drives.read(OFFSET[self._loop]), float) if has_offset else np.zeros(len(where))
         motion.enable(drives, mode=MODE[self._loop], where=where)
@@ -112,13 +112,13 @@ class Shaker:
         _give_modes_back(drives, self._modes, where)
 
     def run(self, amplitude: Floats, speed: Floats, passes: int, periods: int, *, traced: bool = False) -> Pass:
-        """Run there and back; the axes end at rest.
+        """Run in both directions; the axes end at rest.
 
         Args:
-            amplitude: Of each line's velocity [rad/s], shape (n, axes).
-            speed: Steady speed of the first pass, with its sign [rad/s], shape (axes,).
-            passes: Times that the travel is passed, each the other way.
-            periods: Of the excitation in each pass.
+            amplitude: Amplitude of each line's velocity [rad/s], shape (n, axes).
+            speed: Signed steady speed of the first pass [rad/s], shape (axes,).
+            passes: Number of passes, in alternating direction.
+            periods: Number of evaluated periods in each pass.
             traced: Record at the velocity loop's rate as well; on emulated drives only.
         """
         steady, inside = self.steady(speed, passes, periods)
@@ -127,12 +127,12 @@ class Shaker:
         sized = amplitude if self._loop == "velocity" else amplitude / omega
         wave = periodic(self._kind, self._lines, sized * self._where)
         cycles = len(steady)
-        # While the speed changes, which takes current of its own, the shaking is less; it comes back as it settles.
+        # A change of speed takes current itself: the excitation is reduced during it, and increases again afterwards.
         from_end = np.minimum(np.arange(cycles), np.arange(cycles)[::-1])
         level = np.convolve(np.where(turning, IN_RAMPS, 1.0), np.full(FADE, 1.0 / FADE), "same")
         fade = (level * np.clip(from_end / FADE, 0.0, 1.0))[:, None]
         path = steady if self._loop == "velocity" else self._position(steady)
-        # Every second pass it runs backwards: what is not linear then answers differently, and coherence shows it.
+        # Every second pass plays the excitation backwards: non-linear effects then differ, and reduce the coherence.
         back = np.repeat(np.arange(passes) % 2 == 1, cycles // passes + 1)[:cycles, None]
         row = np.arange(cycles) % self._lines.samples
         shaking = np.where(back, wave[::-1][row], wave[row])
@@ -165,12 +165,12 @@ class Shaker:
         return np.asarray(trace[cia402.TORQUE_ACTUAL][REST:].mean(axis=0) * ampere_per_count(self._drives))
 
     def steady(self, speed: Floats, passes: int, periods: int) -> tuple[Floats, Mask]:
-        """Return the steady velocity of every cycle, (cycles, axes), and which cycles are looked at."""
+        """Return the steady velocity of every cycle, (cycles, axes), and which cycles are evaluated."""
         rows, inside, before = [], [], np.zeros_like(speed)
         long = SETTLING + periods * self._lines.samples
         for k in range(passes + 1):
             now = speed * (-1.0) ** k if k < passes else np.zeros_like(speed)
-            # A reversal is twice the change.
+            # A reversal is twice the change of speed.
             ramp = RAMP if k in (0, passes) else 2 * RAMP
             share = (np.arange(1, ramp + 1) / ramp)[:, None]
             rows.append(before + share * (now - before))
@@ -210,7 +210,7 @@ class Shaker:
         return seen, (fast[names[0]], fast[names[1]]), _enabled(self._drives)
 
     def _go_back(self, where: Mask) -> None:
-        """Bring the axes near to where they began."""
+        """Bring the axes close to their first positions."""
         drives = self._drives
         drives.advance(REST * CYCLE)
         off = wrapped(drives.read(cia402.POSITION_ACTUAL) - self._origin) * self.radians * where * BACK
@@ -231,7 +231,7 @@ class Shaker:
 
 @contextmanager
 def at_rest(target: Target, loop: str, where: Mask) -> Iterator[None]:
-    """Have axes enabled meanwhile, in the mode of a loop, so that each holds its place while another one is shaken."""
+    """Enable axes in a loop's mode during the block, so that each holds its position while another one is excited."""
     drives = target.drives
     modes, off = drives.read(cia402.MODE), where & ~_enabled(drives)
     if loop == "velocity" and off.any():
@@ -246,7 +246,7 @@ def at_rest(target: Target, loop: str, where: Mask) -> Iterator[None]:
 
 
 def _give_modes_back(drives: Drives, modes: Integers, where: Mask) -> None:
-    """Write the modes from before; an axis that goes on takes commands in its own, with a drive's mode that fits."""
+    """Restore the modes of axes; those that stay enabled take commands in the restored mode."""
     names = {number: name for name, number in cia402.MODES.items()}
     for mode in np.unique(modes[where]).tolist():
         changed = where & (modes == mode) & (drives.read(cia402.MODE) != mode)
@@ -259,7 +259,7 @@ def _give_modes_back(drives: Drives, modes: Integers, where: Mask) -> None:
 
 @contextmanager
 def let_go(target: Target, where: Mask, shaken: Mask) -> Iterator[None]:
-    """Have axes off meanwhile: of a machine whose axes pull at one thing, those that are not shaken must run along."""
+    """Switch axes off during the block: linked axes that are not excited must follow freely."""
     drives = target.drives
     on = where & _enabled(drives)
     if on.any():
@@ -268,8 +268,8 @@ def let_go(target: Target, where: Mask, shaken: Mask) -> Iterator[None]:
         yield
     finally:
         if on.any():
-            # All come to rest and begin together: enabled under way they would stop askew and pull at each other, and
-            # gains that are fit for all of them need not be fit for one alone.
+            # All come to rest and are enabled together: enabled while others move, they would stop askew and strain the
+            # machine; and gains that are good for all of them may be bad for one alone.
             alone = shaken & _enabled(drives)
             motion.disable(drives, where=alone)
             drives.advance(SETTLED * CYCLE)

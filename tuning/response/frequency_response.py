@@ -1,7 +1,7 @@
-"""Open loops of axes that stay in closed loop: a multisine or a chirp on the set-point, and the coherence.
+"""Measures open loops of axes in closed loop: a multisine or a chirp on the set-point, with the coherence.
 
 The set-point is the instrument: it is known exactly and independent of noise, so that the open loop is the quotient of
-two cross-spectra with it, answer over error, without the bias that noise inside the loop gives to answer over input.
+two cross-spectra with it, response over error, without the bias by noise inside the loop that response over input has.
 """
 
 from __future__ import annotations
@@ -45,27 +45,27 @@ if TYPE_CHECKING:
 LOOPS = ("velocity", "position")
 RANGE = {"velocity": (5.0, 400.0), "position": (5.0, 50.0)}  # Hz
 RESOLUTION = 5.0  # Hz
-# From which on a line is fitted, with the weight that its noise leaves it, once all together say as much as `WORTH`
-# lines that are trusted.
+# Least coherence of a fitted line, which is weighted by its noise; and information, in trusted lines, that the fitted
+# lines must have together.
 FITTED, WORTH = 0.5, 4.0
-BUS_LIMIT = 400.0  # Hz; above, a bus's samples hold more of the images than of the line
-TRACED_TOP = 495.0  # Hz, of the set-points in a traced measurement
+BUS_LIMIT = 400.0  # Hz; above, samples of a bus contain more of the images than of the line
+TRACED_TOP = 495.0  # Hz, greatest frequency of the set-points in a traced measurement
 TRACE_LIMIT = 1000.0  # Hz
 PASSES, PERIODS = 2, 3  # of a measurement; the trial before it has one of each
-SOFTER = 2  # how often the gains of an axis that oscillates are lowered
-CONFIRMING, LESS = 6, 0.5  # passes of one that is confirmed, and the share of its strength in the second half of them
+SOFTER = 2  # how many times the gains of an axis that oscillates are lowered
+CONFIRMING, LESS = 6, 0.5  # passes if confirmed, and share of the excitation in their second half
 
 
-# How an axis is loaded, over its limits.
+# Load of an axis over its limits, in the trial and in the measurement.
 TRIAL_SPEED, TRIAL_CURRENT = 0.1, 0.4
 SPEED, CURRENT = 0.45, 0.9
-TRIAL_SWING, SWING = 0.42, 0.65  # RMS over 25 ms, beyond which it is not the shaking but an oscillation
-SLOWER, TINY = 0.9, 1e-6  # by which a run is made slower and weaker in turn that would overcharge it; J
-ONE_FREQUENCY = 0.5  # of the power of what an oscillation is, within 10 Hz of its frequency; of noise it is 0.05
-RETURN_SHARE = 0.5  # of the speed from which the DC link holds what a stop gives back
-IN_RAMP = 0.5  # of what the shaking takes, for changing the speed
+TRIAL_SWING, SWING = 0.42, 0.65  # RMS over 25 ms, above which the axis oscillates by itself
+SLOWER, TINY = 0.9, 1e-6  # factor, applied until a run does not overcharge the DC link; J
+ONE_FREQUENCY = 0.5  # of an oscillation's power, within 10 Hz of its frequency; for noise it is 0.05
+RETURN_SHARE = 0.5  # of the greatest speed at which the DC link can take the energy of a stop
+IN_RAMP = 0.5  # of the current of the excitation, for changing the speed
 TRAVEL = 0.85
-OVER_NOISE = 5.0  # least RMS of the shaken velocity over the encoder's noise, also where the motion then reverses
+OVER_NOISE = 5.0  # least RMS of the excited velocity over the encoder's noise, even if the motion then reverses
 
 
 @dataclass(frozen=True)
@@ -74,11 +74,11 @@ class Signal:
 
     Attributes:
         kind: "multisine" or "chirp".
-        low: Lowest frequency [Hz]; the loop's own by default, as for `high`.
+        low: Lowest frequency [Hz]; None selects the loop's own, also for `high`.
         high: Highest frequency [Hz], at most 400; a traced measurement always goes beyond. With 4,096 counts per turn
-            little is coherent above 200 Hz, and what excites there is missing below; what stands out there, as
-            resonances do, is still found.
-        resolution: Between two frequencies [Hz]; a period lasts its inverse.
+            little is coherent above 200 Hz, and power there is missing below; distinct features, such as resonances,
+            are still found.
+        resolution: Spacing of the frequencies [Hz]; a period lasts its inverse.
     """
 
     kind: str = "multisine"
@@ -102,25 +102,25 @@ def measure(
     periods: int = PERIODS,
     progress: Callable[[float], None] | None = None,
 ) -> MeasuredLoop:
-    """Measure a loop's frequency response on its axes; they end where they began, as they were found.
+    """Measure a loop's frequency response on its axes; they return to their first positions and states.
 
-    Axes of one machine are shaken one after the other, machines side by side. The others hold their places; where all
-    pull at one thing, they are off and run along.
+    Axes of one machine are excited one after the other, machines at the same time. The other axes hold their positions;
+    linked ones are switched off and follow.
 
     Args:
         target: The axes.
         loop: "velocity", in csv, or "position", in csp.
-        where: Axes that are measured; all by default. The others get nan.
+        where: Axes to measure; all by default. The others get nan.
         signal: The excitation.
-        traced: Look above 400 Hz too, through the emulator's trace at the velocity loop's rate.
-        confirmed: Look longer, and again with half the strength: a resonance that is then another is refused.
-        softened: Quarter the velocity gains, twice at most, of an axis that oscillates in the trial, and leave them so;
-            its drives are watched (`tuning.oscillation_watch`).
-        periods: Of every pass that are looked at: more of them are less noise, and more time.
-        progress: Called with the share done.
+        traced: Also measure above 400 Hz, by the emulator's trace at the velocity loop's rate.
+        confirmed: Measure longer, and again with half the amplitude: a resonance that differs then is refused.
+        softened: Divide the velocity gains of an axis that oscillates in the trial by 4, at most twice, and leave them
+            so; its drives must be watched (`tuning.oscillation_watch`).
+        periods: Number of evaluated periods of every pass: more reduce the noise, and take more time.
+        progress: Called with the share that is done.
 
     Raises:
-        ValueError: For a loop, a kind or frequencies that cannot be, a trace on a bus, or a drive without a linear
+        ValueError: For an unknown loop or kind, impossible frequencies, a trace on a bus, or a drive without a linear
             model of its loops.
     """
     if loop not in LOOPS:
@@ -132,17 +132,17 @@ def measure(
             "a trace at the velocity loop's rate exists on emulated drives only; on a bus up to 400 Hz can be measured"
         )
     lowest, highest = RANGE[loop]
-    # A trace begins where a bus ends; a gap between the two could hide a margin.
+    # The trace begins where a bus ends: a gap between them could hide a margin.
     top = BUS_LIMIT if traced else highest if signal.high is None else signal.high
     if top > BUS_LIMIT:
         raise ValueError(f"highest frequency {top:g} Hz must be at most {BUS_LIMIT:g} Hz, the limit on a bus")
-    # In a trace, what is held at f is seen at 1000 Hz - f, too: lines up to nearly half of it leave no gap.
+    # In a trace, a set-point held at f also appears at 1000 Hz - f: lines up to nearly half of it leave no gap.
     low = lowest if signal.low is None else signal.low
     lines = plan_lines(low, TRACED_TOP if traced else top, signal.resolution, 1.0 / CYCLE)
     axes = np.ones(target.num_axes, bool) if where is None else np.asarray(where, bool)
     if not axes.any():
         raise ValueError("no axis is chosen")
-    check_linear_model(target.device)  # which tells how strongly to shake, before anything moves
+    check_linear_model(target.device)  # it determines the amplitudes; checked before anything moves
     closed = _closed_loops(target, loop)
     if not (axes & closed).any():
         raise ValueError("a P gain is 0 on every axis and the loop is open: give the drives gains first")
@@ -174,7 +174,7 @@ def measure(
 
 
 def _closed_loops(target: Target, loop: str) -> Mask:
-    """Return which axes have the gains that the loop needs."""
+    """Return which axes have P gains above 0 in all loops that the measurement needs."""
     loops = ("current", "velocity") if loop == "velocity" else ("current", "velocity", "position")
     known = target.device.gains
     needed = [known.rows[k].key for each in loops if (k := known.column(each, "P")) is not None]
@@ -182,7 +182,7 @@ def _closed_loops(target: Target, loop: str) -> Mask:
 
 
 class _Measurement:
-    """One measurement of axes side by side: a trial, the run proper, and their results."""
+    """One measurement of several axes at the same time: a trial, the run proper, and their results."""
 
     def __init__(
         self, target: Target, loop: str, where: Mask, lines: Lines, top: float, kind: str, traced: bool,
@@ -194,7 +194,7 @@ class _Measurement:
         self._device: Device = target.device
         self._notes: list[list[str]] = [[] for _ in range(target.num_axes)]
         self._where = where
-        self._stoppable: Floats = np.full(target.num_axes, np.inf)  # speed from which the DC link bears a stop [rad/s]
+        self._stoppable: Floats = np.full(target.num_axes, np.inf)  # greatest speed for a stop by the DC link [rad/s]
 
     def run(self, progress: Callable[[float], object]) -> MeasuredLoop:
         target = self._target
@@ -206,7 +206,7 @@ class _Measurement:
                 room = np.where(target.high >= -target.low, target.high, target.low) * TRAVEL
                 sign = np.sign(room)
                 limit = self._current_limit()
-                # At once: friction that has come to rest would make the trial another one.
+                # Read immediately after the trial: friction at rest would change the current.
                 self._holding = counted.drives.read(cia402.TORQUE_ACTUAL) * ampere_per_count(counted.drives)
                 self._friction = np.zeros(target.num_axes)
                 speed = self._trial_speed(shaker, np.abs(room))
@@ -237,13 +237,13 @@ class _Measurement:
         progress(1.0)
         return result
 
-    # --- how strongly ---------------------------------------------------------------------------------------------
+    # --- amplitudes -----------------------------------------------------------------------------------------------
     def _current_limit(self) -> Floats:
-        """Return the highest permitted current [A]: the user's limit, or the drive's own."""
+        """Return the greatest permitted current [A]: the user's limit, or the drive's own."""
         return np.asarray(np.minimum(self._target.current, read_current_limit(self._target.drives)))
 
     def _trial(self, shaker: Shaker, limit: Floats, speed: Floats, sign: Floats) -> Pass:
-        """Return the response to a weak excitation; an axis that oscillates gets softer gains first, if it may."""
+        """Return the response to a weak excitation; an axis that oscillates first gets softer gains, if allowed."""
         drives = self._target.drives
         watch = watch_of(drives)
         for left in reversed(range(SOFTER + 1)):
@@ -272,10 +272,10 @@ class _Measurement:
         return fed_back(self._target.motor, steady, CYCLE, 0.0, self._holding, self._friction)
 
     def _know_friction(self, trial: Pass, at_rest: Floats, sign: Floats) -> None:
-        """Tell a weight from dry friction, which feeds nothing back, by currents in motion and at rest after it [A].
+        """Separate weight and dry friction, which feeds nothing back, by currents in motion and at rest after it [A].
 
-        In motion along `sign` it is weight + friction; against it -weight + friction, which is not less than what held
-        the axis at rest, friction having taken what it likes up to its own.
+        In motion along `sign` the current is weight + friction; against it -weight + friction, which is at least the
+        current at rest, where friction can hold any part up to its own value.
         """
         moving = trial.current.mean(axis=0)
         self._friction = np.maximum(0.5 * sign * (moving - at_rest), 0.0)
@@ -283,7 +283,7 @@ class _Measurement:
 
     def _trial_amplitude(self, speed: Floats, limit: Floats) -> Floats:
         n = len(self._lines.f)
-        # What reverses the trial's motion does no harm to a rough first look; what cannot be seen does.
+        # A reversing motion is acceptable in the trial; an invisible one is not.
         largest = np.maximum(0.8 * speed, OVER_NOISE * CREST * self._noise())
         by_speed = largest / CREST / math.sqrt(n / 2.0)
         by_current = (
@@ -294,26 +294,26 @@ class _Measurement:
     def _amplitude(
         self, shaker: Shaker, rough: Complex, trial: Pass, room: Floats, limit: Floats
     ) -> tuple[Floats, Floats]:
-        """Return amplitudes and steady speeds of the run proper from the trial."""
+        """Return amplitudes and steady speeds of the run proper, computed from the trial."""
         lines, omega = self._lines, 2.0 * math.pi * self._lines.f[:, None]
         gain, error = _bounded(rough, 1e-3, 10.0), _bounded(1.0 - rough, 0.02, 10.0)
         current = _bounded(self._current_gain() * error, 1e-12, np.inf)
         load = np.abs(trial.current.mean(axis=0))
         available = np.maximum(CURRENT * (limit - load), 0.1 * limit)
-        # Speed per current at the lowest lines, times w: what a ramp of the steady speed takes.
+        # Speed per current at the lowest lines, times w: the acceleration per current, for the ramps.
         low = slice(0, max(4, len(lines.f) // 10))
         mobility = np.median(np.abs(gain / current * omega)[low], axis=0)
         top = SPEED * self._target.speed
         by_ramp = IN_RAMP * available * mobility * RAMP * CYCLE
         by_way = room / _duration(self._periods, lines)
         fastest = np.minimum(np.minimum(top, by_ramp), by_way)
-        # Where the way is short, a steady speed would be too slow for the encoder: the motion reverses then.
+        # On a short way, a steady speed would be too slow for the encoder: the motion then reverses.
         largest = np.minimum(np.maximum(0.9 * fastest, OVER_NOISE * CREST * self._noise()), 0.9 * top)
         amplitude = dimension(lines, np.abs(current), np.abs(gain), available, largest)
         way = peak(self._kind, lines, amplitude, gain / omega)
         flowing, shaken = (peak(self._kind, lines, amplitude, answer) for answer in (current, gain))
         tiny = np.finfo(float).tiny
-        # A stop gives back J w^2 / 2, and a swing 2 J w dw, which the DC link must hold; losses come on top.
+        # A stop feeds back J w^2 / 2, an oscillation 2 J w dw, which the DC link must take; losses are a reserve.
         inertia, held = self._target.motor.torque_constant / mobility, link_energy(self._target)
         energy = held / inertia
         self._stoppable, returned = np.sqrt(2.0 * energy), np.sqrt(energy / (2.0 * 1.1))
@@ -324,7 +324,7 @@ class _Measurement:
         fits = np.min(shares, axis=0)
         amplitude, shaken = amplitude * fits, shaken * fits
         speed = np.minimum(1.1 * shaken, fastest)
-        # A weight that goes down has filled it before the stop.
+        # A descending weight has already charged the link before the stop.
         while True:
             falling = self._falling(shaker, speed, self._passes, self._periods)
             over = falling > LINK_SHARE * np.maximum(held - 0.5 * inertia * (speed + shaken) ** 2, 0.0) + TINY
@@ -339,14 +339,14 @@ class _Measurement:
         return amplitude, speed
 
     def _current_gain(self) -> Complex:
-        """Return demanded current per velocity of the set-point, the loop being open, complex (n, axes)."""
+        """Return demanded current per velocity of the set-point with open loop, complex (n, axes)."""
         f = self._lines.f
         z = np.exp(2j * math.pi * f / self._device.velocity_rate)
         columns = []
         for row in self._gains:
             regulator = controllers(self._device, row)
             gain = regulator.velocity(z)
-            # Of a position loop, the velocity loop within answers up to 1.5 times as strongly.
+            # In a position loop, the inner velocity loop amplifies by up to 1.5.
             columns.append(gain if self._loop == "velocity" else 1.5 * gain * regulator.position / (2j * math.pi * f))
         return np.stack(columns, axis=1)
 
@@ -356,15 +356,15 @@ class _Measurement:
         return velocity_noise(self._device, plant)
 
     def _note_oscillation(self, seen: Pass, where: Mask) -> Mask:
-        """Return which axes oscillate: their currents have parts that do not repeat with the excitation."""
+        """Return which axes oscillate: parts of their currents do not repeat with the excitation."""
         shape = (self._passes, self._periods, self._lines.samples, len(where))
         current = seen.current.reshape(shape)
         own = (current - current.mean(axis=1, keepdims=True)).reshape(self._passes, -1, len(where))
         found = where & shakes(own.reshape(-1, len(where)), self._target.motor.rated_current)
-        # Of the pass in which it is strongest: at the seam of two the swing has another phase.
+        # Evaluate the pass with the strongest oscillation: its phase differs from pass to pass.
         strongest = own[own.std(axis=1).argmax(axis=0), :, np.arange(len(where))].T
         frequency, share = strongest_frequency(strongest)
-        found &= share > ONE_FREQUENCY  # noise has all of them
+        found &= share > ONE_FREQUENCY  # noise has all frequencies
         for axis in np.flatnonzero(found):
             told = f"the loop oscillates at {frequency[axis]:.0f} Hz, whatever it is shaken with"
             also = ", or late SYNCs make its current swing so"
@@ -379,7 +379,7 @@ class _Measurement:
                 "or nearly so"
             )
 
-    # --- what it says ---------------------------------------------------------------------------------------------
+    # --- evaluation -----------------------------------------------------------------------------------------------
     def _evaluate(self, seen: Pass, less: Pass | None, where: Mask) -> MeasuredLoop:
         lines = self._lines._replace(f=self._lines.f[self._lines.f <= self._top])
         f = lines.f
@@ -437,11 +437,11 @@ class _Measurement:
         return fit
 
 
-_Transfer = tuple[Complex, Floats, Floats]  # of one axis, as `transfer` returns it
+_Transfer = tuple[Complex, Floats, Floats]  # of one axis, as returned by `transfer`
 
 
 def _fitted(f: Floats, measured: _Transfer) -> tuple[Seen, Mask]:
-    """Return the lines that are fitted, and which they are: those that are trusted, or all that are not mere noise."""
+    """Return the lines to fit, and their mask: those with some coherence if they suffice, else the trusted ones."""
     closed, coherence, spread = measured
     good = coherence >= FITTED
     clear = np.minimum(coherence[good], COHERENT)
@@ -459,20 +459,20 @@ def _closed_by(device: Device, fit: PlantFit, gains: Integers) -> Callable[[Floa
 
 
 def _bounded(value: Complex, low: float, high: float) -> Complex:
-    """Return complex numbers whose size lies within bounds; a first look is not trusted beyond them."""
+    """Limit the size of complex numbers; the trial is too rough beyond these limits."""
     size = np.maximum(np.abs(value), np.finfo(float).tiny)
     return np.asarray(np.where(value == 0.0, low, value * np.clip(size, low, high) / size))
 
 
 def _duration(periods: int, lines: Lines) -> float:
-    """Return how long an axis goes one way [s], in full speeds."""
+    """Return how long an axis moves in one direction [s], as time at full speed."""
     return (2 * RAMP + SETTLING + periods * lines.samples) * CYCLE
 
 
 def _fast(device: Device, seen: Pass, lines: Lines) -> tuple[Floats, Complex, Floats]:
-    """Return frequencies above the bus's, open loop and coherence there, from the trace.
+    """Return frequencies above the bus's limit, open loop and coherence there, from the trace.
 
-    What excites there are the images of the held set-points.
+    The excitation there consists of the images of the held set-points.
     """
     windows = len(seen.fast_answer) // len(seen.answer)
     first = int(BUS_LIMIT / lines.rate * lines.samples) + 1
@@ -480,7 +480,7 @@ def _fast(device: Device, seen: Pass, lines: Lines) -> tuple[Floats, Complex, Fl
     bins = np.arange(first, last + 1)
     all_lines = Lines(bins * lines.rate / lines.samples, lines.samples * windows, lines.rate * windows)
     closed, coherence, _ = transfer(seen.fast_set_point, seen.fast_answer, all_lines)
-    # What is excited are the lines and their images; multiples of the bus's rate the holding takes out.
+    # Only the lines and their images are excited; holding removes multiples of the bus's rate.
     folded = np.minimum(bins % lines.samples, -bins % lines.samples)
     lit = np.isin(folded, lines.bins)
     return all_lines.f[lit], (closed / (1.0 - closed))[lit], coherence[lit]

@@ -1,4 +1,4 @@
-"""A measured loop: its lines, which of them are trusted, and the values between them."""
+"""A measured loop: its lines, their mask of trusted ones, and values between the lines."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ if TYPE_CHECKING:
     from tuning.response.plant_fit import PlantFit
 
 
-COHERENT = 0.95  # from which on a line is trusted
-FINE = 10  # points between two lines, where margins are looked for
-SMOOTHING = 1.5  # lines, standard deviation
-DRAWS, DRAWN_SEED, SURE = 100, 20, 2.5  # plants within a fit's intervals, and the percentile that is "at least"
-MODEL_POINTS, MODEL_LOW, NYQUIST = 400, 2.0, 0.49  # frequencies of a model: how many, from [Hz], up to of its rate
+COHERENT = 0.95  # least coherence of a trusted line
+FINE = 10  # points between two lines, at which margins are searched
+SMOOTHING = 1.5  # lines, standard deviation of the averaging
+DRAWS, DRAWN_SEED, SURE = 100, 20, 2.5  # plants drawn within a fit's intervals; percentile as lower bound
+MODEL_POINTS, MODEL_LOW, NYQUIST = 400, 2.0, 0.49  # frequencies of a model: number, lowest [Hz], highest over its rate
 
 
 class Loops(NamedTuple):
-    """Both outer loops of an axis by one measurement: frequencies [Hz], complex open loops, trusted lines.
+    """Both outer loops of an axis from one measurement: frequencies [Hz], complex open loops, trusted lines.
 
-    All of shape (n,). The position loop is that of the measured velocity loop, closed, and of the position P.
+    All of shape (n,). The position loop is computed from the measured velocity loop and position P.
     """
 
     f: Floats
@@ -39,7 +39,7 @@ class Loops(NamedTuple):
     trusted: Mask
 
     def margins(self) -> dict[str, margins_.Margins]:
-        """Return the margins of both by name, by their trusted lines; nan for those that they do not show."""
+        """Return the margins of both by name, from their trusted lines; nan for those not measured."""
         both = {"velocity": self.velocity, "position": self.position}
         return {name: seen_margins(self.f, L, self.trusted) for name, L in both.items()}
 
@@ -53,20 +53,20 @@ class AtLeast(NamedTuple):
 
 @dataclass(frozen=True)
 class MeasuredLoop:
-    """A loop as measured; arrays are (n,) over frequencies or (n, axes).
+    """A measured loop; arrays are (n,) over frequencies or (n, axes).
 
     Attributes:
-        device: What was measured.
+        device: Device of the drives.
         loop: "velocity" or "position".
         f: Frequencies [Hz].
-        open_loop: L; nan where nothing was measured.
-        coherence: Of set-point with answer and with error, the lower of the two, 0...1.
-        traced: Which frequencies come from an emulator's trace at the velocity loop's rate; no bus shows them.
-        gains: Raw gains in force, shape (axes, count).
+        open_loop: L; nan if not measured.
+        coherence: The lower one of set-point with response and set-point with error, 0...1.
+        traced: Frequencies that come from an emulator's trace at the velocity loop's rate; a bus cannot show them.
+        gains: Raw gains during the measurement, shape (axes, count).
         fits: The fitted linear model of each axis; None for the position loop.
-        peak_speed, peak_current: Of the shaking [rad/s], [A], shape (axes,).
+        peak_speed, peak_current: Peaks of the excitation [rad/s], [A], shape (axes,).
         drive_time: Time that passed on the drives [s].
-        notes: Of each axis, for people.
+        notes: Notes on each axis, for users.
     """
 
     device: Device
@@ -84,24 +84,24 @@ class MeasuredLoop:
 
     @property
     def trusted(self) -> Mask:
-        """Which lines are coherent enough to be taken as truth, (n, axes)."""
+        """Lines that are coherent enough to be trusted, (n, axes)."""
         return np.asarray((self.coherence >= COHERENT) & np.isfinite(self.open_loop))
 
     @property
     def closed_loop(self) -> Complex:
-        """From set-point to answer."""
+        """Closed loop, from set-point to response."""
         return np.asarray(self.open_loop / (1.0 + self.open_loop))
 
     def margins(self, axis: int = 0) -> margins_.Margins:
-        """Return the margins of an axis, by its trusted lines; nan for those that they do not show."""
+        """Return the margins of an axis from its trusted lines; nan for those not measured."""
         return seen_margins(*self.refined(axis))
 
     def refined(self, axis: int = 0) -> tuple[Floats, Complex, Mask]:
-        """Return frequencies, open loop, and which of them are trusted, between the lines too.
+        """Return frequencies, open loop, and which of them are trusted, also between the lines.
 
-        Where the linear model fits, what is measured is its quotient with the model, which changes slowly, also where
-        a resonance is narrower than the lines' distance: averaged over neighbours and interpolated, it has a fraction
-        of a line's noise. Without a fit the lines stand as they are.
+        If the linear model fits, the measurement's quotient with the model is averaged over neighbours and
+        interpolated: it changes slowly, even where a resonance is narrower than the lines' spacing, and then has a
+        fraction of a line's noise. Without a fit the lines are returned unchanged.
         """
         fit, L, good = self.fits[axis], self.open_loop[:, axis], self.trusted[:, axis]
         if fit is None or not fit.is_good or good.sum() < 2:
@@ -109,32 +109,32 @@ class MeasuredLoop:
         lines = np.arange(len(self.f))
         at = np.interp(np.arange(FINE * (len(self.f) - 1) + 1) / FINE, lines, self.f)
         model, fine = (fit.open_loop(self.device, self.gains[axis], x) for x in (self.f, at))
-        # A line says as much as its coherence: its weight is one over its variance.
+        # The weight of a line is one over its variance, which follows from its coherence.
         clear = np.clip(self.coherence[:, axis], 0.0, 1.0 - 1e-6)
         certain = np.where(np.isfinite(L) & (clear > 0.5), clear / (1.0 - clear), 0.0)
         near = certain * np.exp(-0.5 * ((lines - np.arange(len(at))[:, None] / FINE) / SMOOTHING) ** 2)
         quotient = np.where(certain > 0.0, L / model, 0.0)
         total = near.sum(axis=1)
-        # Neighbours together may be as certain as one line must be.
+        # Several neighbours together may be as certain as one trusted line.
         known = total >= COHERENT / (1.0 - COHERENT)
         return at, fine * np.where(known, near @ quotient / np.maximum(total, np.finfo(float).tiny), 1.0), known
 
     def loops(
         self, gains: Sequence[int] | Integers, axis: int = 0, *, plant: Plant | None = None, refined: bool = True
     ) -> Loops:
-        """Return the loops with other gains from a measured velocity loop: changed as those change the linear model.
+        """Return the loops with other gains, from a measured velocity loop: changed as the linear model changes.
 
-        What is not in the model, as friction or a second resonance, was measured; gains of the outer loops change it by
-        a factor that is known exactly, those of the torque loop by what the winding makes of them.
+        Effects that are not in the model, such as friction or a second resonance, are measured; gains of the outer
+        loops change the loop by an exactly known factor, those of the torque loop by the model of the winding.
 
         Args:
             gains: Raw gains, shape (count,).
             axis: Number of the axis.
-            plant: The axis, for other gains of the torque loop; what was fitted by default.
-            refined: Between the lines too, as `refined` has them; else the lines as they are.
+            plant: The axis, for other gains of the torque loop; the fitted one by default.
+            refined: Include points between the lines, as in `refined`; else only the lines.
 
         Raises:
-            ValueError: For the response of a position loop.
+            ValueError: For a measured position loop.
         """
         fit = self.fits[axis]
         if fit is None:
@@ -152,7 +152,7 @@ class MeasuredLoop:
         return Loops(f, velocity, outer_loop(self.device, fit.plant, now, f, velocity), trusted)
 
     def extended(self, f: Floats, axis: int = 0) -> MeasuredLoop:
-        """Return the loop at other frequencies [Hz], (n,), by the fitted model and by what an axis measured over it."""
+        """Return the loop at other frequencies [Hz], (n,): the fitted model times the measured deviation from it."""
         fit = self.fits[axis]
         assert fit is not None and fit.is_good, "a model fits"
         at, L, _ = self.refined(axis)
@@ -166,7 +166,7 @@ class MeasuredLoop:
         )  # fmt: skip
 
     def at_least(self, loop: str, gains: Sequence[int] | Integers, axis: int = 0) -> AtLeast:
-        """Return lower bounds of a loop's margins, by the fitted model, everything within its intervals.
+        """Return lower bounds of a loop's margins, from models drawn within the fit; nan without a good fit.
 
         Args:
             loop: "velocity" or "position".
@@ -175,18 +175,18 @@ class MeasuredLoop:
         """
         fit = self.fits[axis]
         if fit is None or not fit.is_good or (fit.plant.is_elastic and not fit.estimates["resonance"].is_known):
-            return AtLeast(math.nan, math.nan)  # what was refused as a resonance may be the play of a gear
+            return AtLeast(math.nan, math.nan)  # a refused resonance may be the backlash of a gear
         f = np.geomspace(MODEL_LOW, NYQUIST * self.device.velocity_rate, MODEL_POINTS)
         found = []
         for drawn in fit.drawn(np.random.default_rng(DRAWN_SEED), DRAWS):
             L = drawn.open_loop(self.device, np.asarray(gains), f)
             one = margins_.margins(f, L if loop == "velocity" else outer_loop(self.device, drawn.plant, gains, f, L))
-            # A loop whose gain never passes 1, or whose phase never reaches -180 degrees, has all the margin there is.
+            # A loop whose gain never passes 1, or whose phase never reaches -180 degrees, has an infinite margin.
             found.append((180.0 if math.isnan(one.phase_deg) else one.phase_deg, one.gain_db))
         return AtLeast(*(float(value) for value in np.percentile(found, SURE, axis=0, method="lower")))
 
     def replaced(self, other: MeasuredLoop, where: Mask) -> MeasuredLoop:
-        """Return this with another measurement of some axes, (axes,), in place of theirs."""
+        """Replace the measurement of some axes, (axes,), by another one."""
         return replace(
             self,
             open_loop=np.where(where, other.open_loop, self.open_loop),
@@ -202,10 +202,10 @@ class MeasuredLoop:
     def estimates(self, axis: int = 0) -> dict[str, Estimate]:
         """Return inertia, velocity_filter, loop_delay, anti_resonance, resonance and damping of an axis.
 
-        Each has its interval, or the reason why it is refused.
+        Each has its interval, or the reason of its refusal.
 
         Raises:
-            ValueError: For the response of a position loop, or of an axis without one; its notes say why.
+            ValueError: For a measured position loop, or an axis without a response; its notes say why.
         """
         fit = self.fits[axis]
         if fit is None and self.loop == "velocity":
@@ -216,16 +216,16 @@ class MeasuredLoop:
 
 
 def seen_margins(f: Floats, open_loop: Complex, trusted: Mask) -> margins_.Margins:
-    """Return margins of a loop by its trusted lines, arrays (n,), without a gain margin that was not measured.
+    """Return margins of a loop from its trusted lines, arrays (n,); an infinite gain margin becomes nan.
 
-    A phase of -180 degrees that was not reached may lie above the frequencies looked at.
+    If -180 degrees was not reached, that may happen above the measured frequencies.
     """
     found = margins_.margins(f, open_loop, trusted)
     return found if math.isfinite(found.gain_db) else found._replace(gain_db=math.nan)
 
 
 def merged(results: Sequence[MeasuredLoop]) -> MeasuredLoop:
-    """Return measurements of different axes as one; each axis was in one of them."""
+    """Join measurements of different axes; each axis was measured in one of them."""
     whole = results[0]
     for other in results[1:]:
         whole = whole.replaced(other, np.asarray(np.isfinite(other.open_loop).any(axis=0)))

@@ -1,8 +1,8 @@
-"""An axis's plant from a measured velocity loop: inertia, resonance, delay and velocity filter, with their intervals.
+"""Fits an axis' plant to a measured velocity loop: inertia, resonance, delay and velocity filter, with intervals.
 
-The linear model is fitted to what was measured, images of held set-points included, so nothing need be known above
-half the bus's rate. Weights are what coherence says of the noise. A rigid axis has four unknowns, one whose load
-swings has seven, one with two springs in a row ten; which it is, the data decide, by Bayes's information criterion.
+The linear model is fitted to the measurement including the images of held set-points, so that nothing need be known
+above half the bus's rate. Weights follow from the coherence. A rigid axis has four unknowns, one with an elastic load
+seven, one with two springs in a row ten; Bayes's information criterion selects the model.
 """
 
 from __future__ import annotations
@@ -27,75 +27,75 @@ if TYPE_CHECKING:
     from tuning.estimate import Estimate
 
 
-LINEAR = 0.01  # share by which the linear model may be off at a line for reasons that repeat: friction, cogging
-VALLEY, NEIGHBOURS = 0.02, 5  # the same, of the greatest among so many neighbours
-FEWEST = 12  # lines
-LEAST_GAIN = 10.0  # by which the criterion must improve for a resonance to be believed
-SURE = 3.0  # standard deviations of a resonance's distance from its anti-resonance, at least
-# What repeats and is not in the linear model, as standard deviations: logarithms, and s of the delay. The bridge's dead
-# time swallows some of what small currents ask for, friction broadens a resonance.
+LINEAR = 0.01  # relative error of the linear model at a line by effects that repeat: friction, cogging
+VALLEY, NEIGHBOURS = 0.02, 5  # the same error, of the greatest among so many neighbours
+FEWEST = 12  # least number of lines
+LEAST_GAIN = 10.0  # least improvement of the criterion with which a resonance is accepted
+SURE = 3.0  # standard deviations: least distance of a resonance from its anti-resonance
+# Errors that repeat and are not in the linear model, as standard deviations of logarithms, and of the delay in s. Dead
+# time of the bridge takes part of small currents, friction broadens a resonance.
 SYSTEMATIC = {
     "inertia": 0.02, "velocity_filter": 0.04, "loop_delay": 15e-6, "anti_resonance": 0.008, "resonance": 0.004,
     "damping": 0.15,
 }  # fmt: skip
-# Half of an interval over the value, above which it is no identification.
+# Greatest half width of an interval over the value; wider ones are refused.
 WIDEST = {
     "inertia": 0.3, "velocity_filter": 0.3, "loop_delay": 0.4, "anti_resonance": 0.1, "resonance": 0.1, "damping": 2.0,
 }  # fmt: skip
-# s, standard deviation of what is expected of the delay before it is measured: without any, a few low frequencies
-# cannot tell it from the velocity filter, and both get lost.
+# s, standard deviation of the prior of the delay: without it, a few low frequencies cannot separate delay and velocity
+# filter, and both are lost.
 EXPECTED_DELAY = 50e-6
-# Share of what dead time may add to the winding's resistance that is expected, and its deviation: currents that swing
-# through zero seldom see all of it, and this alone distinguishes it from the lag of the velocity filter.
+# Expected share, and its deviation, of the resistance that dead time may add to the winding's: currents that swing
+# through zero rarely see all of it, and only this prior separates it from the lag of the velocity filter.
 EXPECTED_LOSS, LOSS_SPREAD = 0.5, 0.4
-LEVEL = 0.03  # by which a resonance may move with the strength of the shaking, unless noise explains more
-DISTORTED = 0.13  # share by which passes may differ beyond noise
+LEVEL = 0.03  # greatest relative change of a resonance with the amplitude, beyond noise
+DISTORTED = 0.13  # greatest relative difference of passes beyond noise
 PAIR = ("anti_resonance", "resonance", "damping")
-DAMPED = {"anti_resonance": 0.03, "resonance": 0.03, "damping": 0.0}  # share of the damping that may move a pair
-ABOUT = 1.1  # of a pair: how far the lines go that tell it when it lies close together
-SECONDS, SPACING = 6, 0.25  # beginnings that are tried for a second pair, and their distance, a logarithm
-RATIOS = (1.15, 1.4, 1.8, 2.6)  # of a resonance over its anti-resonance, where the search begins
-# Where the search for a pair begins: the cheapest of those about the deepest swing, between the lines to either side of
-# its ends, and of a grid over all frequencies. A lightly damped pair is found from nearby alone.
+DAMPED = {"anti_resonance": 0.03, "resonance": 0.03, "damping": 0.0}  # share of the damping by which a pair may shift
+ABOUT = 1.1  # of a pair: range of lines around it that show it if its frequencies are close together
+SECONDS, SPACING = 6, 0.25  # number of starting points for a second pair, and their least distance (logarithmic)
+RATIOS = (1.15, 1.4, 1.8, 2.6)  # of a resonance over its anti-resonance, at starting points
+# Starting points of the search for a pair: the best of those around the largest swing, between the lines next to its
+# ends, and of a grid over all frequencies. A lightly damped pair is found from close starting points only.
 BETWEEN, DAMPINGS, LOWS, BEGINNINGS = 7, (0.005, 0.02, 0.08), 16, 5
-GOOD_MISFIT = 2.0  # of a fit by which margins may be read between lines
-RIGID_ENOUGH = 1.5  # misfit up to which no further resonance is looked for
+GOOD_MISFIT = 2.0  # greatest misfit of a fit from which margins may be read between lines
+RIGID_ENOUGH = 1.5  # misfit up to which no further resonance is searched
 NAMES = ("inertia", "velocity_filter", "loop_delay", "anti_resonance", "resonance", "damping")
 _UNITS = dict(zip(NAMES, ("kg*m^2", "Hz", "s", "Hz", "Hz", "1"), strict=True))
-_FIELDS = {"loop_delay": "delay"}  # names of estimates that a plant calls otherwise
-NORMAL_95 = 1.96  # standard deviations to either side that hold 95 %
+_FIELDS = {"loop_delay": "delay"}  # names of estimates that differ from the plant's field
+NORMAL_95 = 1.96  # standard deviations to either side that contain 95 %
 _LOWEST_FILTER, _HIGHEST_FILTER, _LONGEST_DELAY = 50.0, 2000.0, 5e-3
 
 
 class Pair(NamedTuple):
-    """An anti-resonance and the resonance above it [Hz], and their damping, beyond those of a plant."""
+    """An anti-resonance and the resonance above it [Hz], and their damping, in addition to those of a plant."""
 
     anti_resonance: float
     resonance: float
     damping: float
 
     def response(self, f: Floats) -> Complex:
-        """Return the factor by which the pair changes the velocity that a torque makes; 1 far below."""
+        """Return the factor by which the pair changes velocity per torque; 1 far below."""
         swing = 2.0 * self.damping * 1j * f / self.resonance
         return np.asarray((1.0 - (f / self.anti_resonance) ** 2 + swing) / (1.0 - (f / self.resonance) ** 2 + swing))
 
 
 class PlantFit(NamedTuple):
-    """The fitted plant, and each parameter with its interval; `reason` says why the fit is refused.
+    """The fitted plant, and each parameter with its interval; `reason` says why the fit is refused, "" if it is not.
 
-    The plant has the first pair of anti-resonance and resonance; a second one, above it, is in `second`.
+    The plant has the first pair of anti-resonance and resonance; `second` is a second one above it.
     """
 
     plant: Plant
     estimates: dict[str, Estimate]
-    misfit: float  # RMS of the residuals over what noise and LINEAR explain; about 1 if the model fits
+    misfit: float  # RMS of the residuals over the part explained by noise and LINEAR; about 1 if the model fits
     reason: str = ""
     second: Pair | None = None
-    lost: float = 0.0  # what dead time adds to the resistance of a winding that is shaken [ohm]
+    lost: float = 0.0  # resistance that dead time adds to the winding of an excited axis [ohm]
 
     @property
     def is_good(self) -> bool:
-        """Whether there is a fit that is good enough to read margins between lines by."""
+        """Whether the fit is good enough to read margins between lines from it."""
         return not self.reason and self.misfit <= GOOD_MISFIT
 
     def open_loop(self, device: Device, gains: Integers, f: Floats) -> Complex:
@@ -103,14 +103,14 @@ class PlantFit(NamedTuple):
         return _open_loop(device, _Model(self.plant, self.second), gains, f, self.lost)
 
     def drawn(self, rng: np.random.Generator, count: int) -> Iterator[PlantFit]:
-        """Yield fits with each parameter drawn from its interval; refused ones stay as they are."""
+        """Yield fits with each parameter drawn from its interval; refused parameters are not varied."""
         for _ in range(count):
             values = {}
             for name, estimate in self.estimates.items():
                 if math.isfinite(estimate.value) and math.isfinite(estimate.high - estimate.low):
                     at = rng.normal(estimate.value, (estimate.high - estimate.low) / (2.0 * NORMAL_95))
                     values[_FIELDS.get(name, name)] = max(at, 0.1 * estimate.value)
-            # One of the two may have been refused: it stays as it is, and the other is not to pass it.
+            # If one of the two was refused it is not varied, and the other must not cross it.
             ends = [values.get(name, getattr(self.plant, name)) for name in ("anti_resonance", "resonance")]
             if not self.plant.is_elastic or ends[0] < ends[1]:
                 yield self._replace(plant=replace(self.plant, **values))  # type: ignore[arg-type]  # none of them is counts
@@ -119,17 +119,17 @@ class PlantFit(NamedTuple):
 class _Model(NamedTuple):
     plant: Plant
     second: Pair | None = None
-    loss: float = EXPECTED_LOSS  # of what dead time may add to the resistance, the share that it does
+    loss: float = EXPECTED_LOSS  # share of the resistance that dead time may add
 
 
 class _Solution(NamedTuple):
     model: _Model
     residuals: Floats
-    jacobian: Floats  # their derivatives by the parameters, as `_unpack` takes them
+    jacobian: Floats  # derivatives of the residuals by the parameters in the order of `_unpack`
 
 
 def _open_loop(device: Device, model: _Model, gains: Integers, f: Floats, lost: float) -> Complex:
-    # The winding of a model is the data sheet's: what dead time adds to it comes here.
+    # The winding of a model is the data sheet's; the resistance added by dead time is included here.
     L = velocity_open_loop(device, replace(model.plant, R=model.plant.R + lost), gains, f)
     return L if model.second is None else L * model.second.response(f)
 
@@ -143,15 +143,15 @@ def fit_plant(
     Args:
         device: The drive.
         gains: Raw gains in force, shape (count,).
-        f: Frequencies that are trusted [Hz], shape (n,).
-        seen: Set-point to velocity, both as on the bus, shape (n,).
-        spread: Standard deviation of each line over its size, shape (n,).
-        start: What the data sheet says.
-        parts: What single passes saw, which differ in direction, shape (n,) each. By what they differ, intervals are
-            wider.
-        distortion: Share by which passes differ beyond noise; above `DISTORTED` resonances are refused.
-        lost: What dead time may add to the resistance [ohm]: see `dead_time_resistance`.
-        less: The same axis shaken less. Where that says another resonance it is refused, and where it says none.
+        f: Trusted frequencies [Hz], shape (n,).
+        seen: Response from set-point to velocity, both as on the bus, shape (n,).
+        spread: Relative standard deviation of each line, shape (n,).
+        start: Plant from the data sheet.
+        parts: Responses of single passes, which differ in direction, shape (n,) each. Their differences widen the
+            intervals.
+        distortion: Relative difference of passes beyond noise; above `DISTORTED` resonances are refused.
+        lost: Resistance that dead time may add [ohm]: see `dead_time_resistance`.
+        less: The same axis excited less. If that gives another resonance or none, the resonance is refused.
     """
     if len(f) < FEWEST:
         return _refusal(start, f"only {len(f)} frequencies are coherent, and {FEWEST} are needed")
@@ -159,7 +159,7 @@ def fit_plant(
     begin = _with_inertia(start, device, gains, f, rough)
     loop = _Loop(device, gains, f, seen, _weight(seen, spread), lost)
     best = rigid = _solve(loop, _Model(begin))
-    # What will be confirmed may be looked for where a rigid axis would explain it, too.
+    # With a confirming measurement a resonance is searched even if a rigid axis would explain the response.
     if _misfit(rigid) > RIGID_ENOUGH or less is not None:
         ones = [_solve(loop, _Model(pair)) for pair in _candidate_pairs(loop, rough, begin)]
         best = _better(rigid, ones)
@@ -170,7 +170,7 @@ def fit_plant(
         change, doubt = _by_level(loop, best, less)
         scatter = np.hypot(scatter, change)
     fit = _with_intervals(best, f, scatter, lost)
-    # What is confirmed may differ from pass to pass for other reasons.
+    # If the resonance was confirmed, passes may differ for other reasons.
     if (doubt or less is None) and distortion > DISTORTED:
         why = (
             f"the response depends on the direction of the excitation, by {100.0 * distortion:.0f} % beyond noise: "
@@ -182,13 +182,13 @@ def fit_plant(
 
 def _weight(seen: Complex, spread: Floats) -> Floats:
     size = np.abs(seen)
-    # In the valley of an anti-resonance the non-linear part, small elsewhere, is all that is left.
+    # In the valley of an anti-resonance only the non-linear part remains, which is small elsewhere.
     around = maximum_filter1d(size, NEIGHBOURS)
     return np.asarray(1.0 / np.sqrt(size**2 * (spread**2 / 2.0 + LINEAR**2) + (VALLEY * around) ** 2))
 
 
 def _by_level(loop: _Loop, found: _Solution, less: Seen) -> tuple[Floats, str]:
-    """Return by how much parameters differ beyond noise where an axis is shaken less, and why its pair is refused."""
+    """Return by how much parameters change beyond noise with less excitation, and why the pair is refused, else ""."""
     p = _with_resonance(_pack(found.model))
     if len(less.f) < FEWEST:
         return np.zeros(len(p)), (
@@ -213,7 +213,7 @@ def _by_level(loop: _Loop, found: _Solution, less: Seen) -> tuple[Floats, str]:
 
 
 def _with_resonance(p: Floats) -> Floats:
-    """Return parameters and, of an elastic axis, the logarithm of its resonance, which is the sum of two."""
+    """Append the logarithm of an elastic axis' resonance, the sum of two parameters; 0 for a rigid axis."""
     return np.append(p, p[FIRST] + p[FIRST + 1]) if len(p) > FIRST else np.append(p, 0.0)
 
 
@@ -233,16 +233,16 @@ def _covariance(solution: _Solution) -> Floats:
 
 
 def _better(simple: _Solution, found: list[_Solution]) -> _Solution:
-    """Return the best of the fits, or the simpler one if the data do not clearly ask for more."""
+    """Return the best of the fits, or the simpler one if the improvement is too small."""
     sure = [solution for solution in found if _is_sure(solution)]
     best = min(sure, key=_criterion, default=simple)
     return best if _criterion(best) < _criterion(simple) - LEAST_GAIN else simple
 
 
 def _scatter(loop: _Loop, found: _Solution, spread: Floats, parts: Sequence[Complex]) -> Floats:
-    """Return by how much parameters differ between single passes, and between quiet lines and all: half of it each.
+    """Return half the difference of parameters between single passes, and between quiet lines and all lines.
 
-    Those of the model, and of the resonance in the end, shape (parameters + 1,).
+    Parameters of the model, and finally the resonance's, shape (parameters + 1,).
     """
     p = _with_resonance(_pack(found.model))
     if not parts:
@@ -254,21 +254,22 @@ def _scatter(loop: _Loop, found: _Solution, spread: Floats, parts: Sequence[Comp
     passes = [parameters(loop._replace(seen=part, weight=loop.weight / math.sqrt(len(parts)))) for part in parts]
     plant, quiet = found.model.plant, spread <= np.median(spread)
     if plant.is_elastic:
-        # Only the few lines about a pair that lies close together show it; without these the fit takes any other one.
+        # Only the few lines around a pair of close frequencies show it; without these the fit would take any other
+        # pair.
         quiet |= (loop.f > plant.anti_resonance / ABOUT) & (loop.f < plant.resonance * ABOUT)
     fewer = parameters(loop._replace(f=loop.f[quiet], seen=loop.seen[quiet], weight=loop.weight[quiet]))
     return np.asarray(0.5 * np.hypot(np.ptp(passes, axis=0), fewer - p))
 
 
 def _doubted(fit: PlantFit, reason: str) -> PlantFit:
-    """Return a fit without its pair."""
+    """Return a fit with its pair refused."""
     from tuning.estimate import refused
 
     return fit._replace(estimates=fit.estimates | {name: refused(_UNITS[name], reason) for name in PAIR})
 
 
 class Seen(NamedTuple):
-    """A closed velocity loop at its trusted frequencies, as `fit_plant` takes it, shape (n,) each."""
+    """A closed velocity loop at its trusted frequencies, shape (n,) each; fields as in `fit_plant`."""
 
     f: Floats  # Hz
     seen: Complex
@@ -276,14 +277,14 @@ class Seen(NamedTuple):
 
 
 class _Loop(NamedTuple):
-    """A closed velocity loop as the bus sees it, and the weight of each line."""
+    """A closed velocity loop as seen on the bus, with the weight of each line."""
 
     device: Device
     gains: Integers
     f: Floats
     seen: Complex
     weight: Floats
-    lost: float  # ohm, as `fit_plant` takes it
+    lost: float  # ohm, as in `fit_plant`
 
 
 def _solve(loop: _Loop, start: _Model) -> _Solution:
@@ -322,9 +323,9 @@ def _residuals(loop: _Loop, model: _Model) -> Floats:
     return np.asarray(np.nan_to_num(np.concatenate([off.real, off.imag]), nan=1e6, posinf=1e6, neginf=-1e6))
 
 
-_BEYOND = 20.0  # uncertainty of a logarithm that is as good as infinite
+_BEYOND = 20.0  # standard deviation of a logarithm that counts as infinite
 _SCALE = 1e4  # of the delay's parameter, 1/s
-FIRST = 4  # parameter: of the first pair; before it those of a rigid axis
+FIRST = 4  # index of the first pair's first parameter; those before it are a rigid axis'
 
 
 def _pack(model: _Model) -> Floats:
@@ -355,7 +356,7 @@ def _misfit(solution: _Solution) -> float:
 
 
 def _is_sure(solution: _Solution) -> bool:
-    """Return whether every resonance is apart from its anti-resonance for certain."""
+    """Return whether every resonance is significantly apart from its anti-resonance."""
     covariance = _covariance(solution)
     p = _pack(solution.model)
     return all(bool(p[k] > SURE * math.sqrt(max(covariance[k, k], 0.0))) for k in range(FIRST + 1, len(p), 3))
@@ -366,9 +367,9 @@ def _criterion(solution: _Solution) -> float:
     return float(n * math.log(float(np.mean(solution.residuals**2))) + solution.jacobian.shape[1] * math.log(n))
 
 
-# --- where to begin ---------------------------------------------------------------------------------------------------
+# --- starting points --------------------------------------------------------------------------------------------------
 def _rough_loop(device: Device, gains: Integers, f: Floats, seen: Complex) -> Complex:
-    """Return velocity per demanded current with the images still in it."""
+    """Return velocity per demanded current, still with the images."""
     from tuning.response.held_samples import unhold
 
     closed = unhold(device, f, seen, np.zeros(f.shape, complex))
@@ -382,7 +383,7 @@ def _with_inertia(plant: Plant, device: Device, gains: Integers, f: Floats, roug
 
 
 def _candidate_pairs(loop: _Loop, rough: Complex, rigid: Plant) -> list[Plant]:
-    """Return plants with a pair to begin with: about the deepest swing of the response, and of a coarse grid."""
+    """Return plants with a pair as starting points: around the largest swing of the response, and on a coarse grid."""
     device, gains, f = loop.device, loop.gains, loop.f
     level = 20.0 * np.log10(np.abs(rough / velocity_plant(device, rigid, gains, f)))
     pairs = []
@@ -409,7 +410,7 @@ def _candidate_pairs(loop: _Loop, rough: Complex, rigid: Plant) -> list[Plant]:
 
 
 def _candidate_seconds(loop: _Loop, ones: list[_Solution]) -> list[_Model]:
-    """Return models with two pairs to begin with: that of one spring, as it was found, and another below or above."""
+    """Return models with two pairs as starting points: the pair that was found, and another below or above it."""
     models = []
     for plant in {round(one.model.plant.resonance): one.model.plant for one in ones}.values():
         mine = Pair(plant.anti_resonance, plant.resonance, min(plant.damping, 0.05))
@@ -417,24 +418,24 @@ def _candidate_seconds(loop: _Loop, ones: list[_Solution]) -> list[_Model]:
             for ratio in (1.08, *RATIOS):
                 first, second = sorted((mine, Pair(float(low), float(low * ratio), 0.03)))
                 models.append(_Model(replace(plant, **first._asdict()), second))
-    # Of two springs in a row the first resonance lies below the second anti-resonance.
+    # With two springs in a row the first resonance is below the second anti-resonance.
     apart = [m for m in models if m.second is not None and m.second.anti_resonance > m.plant.resonance]
     chosen: list[_Model] = []
     for model in sorted(apart, key=lambda model: _cost(loop, model)):
-        # From all over the range: the cheapest beginnings are often neighbours that lead nowhere.
+        # Spread over the whole range: the best starting points are often neighbours that lead nowhere.
         if all(abs(math.log(_middle(model) / _middle(other))) > SPACING for other in chosen):
             chosen.append(model)
     return chosen[:SECONDS]
 
 
 def _middle(model: _Model) -> float:
-    """Return where a beginning puts its pairs [Hz^2]."""
+    """Return a measure of the position of a starting point's pairs [Hz^2]."""
     assert model.second is not None
     return model.second.anti_resonance * model.plant.anti_resonance
 
 
 def _cost(loop: _Loop, model: _Model) -> float:
-    return float(np.sum(np.log1p(_residuals(loop, model) ** 2)))  # a resonance a line off is not quite wrong
+    return float(np.sum(np.log1p(_residuals(loop, model) ** 2)))  # limits the cost of one line off
 
 
 # --- intervals --------------------------------------------------------------------------------------------------------
@@ -453,7 +454,7 @@ def _with_intervals(solution: _Solution, f: Floats, scatter: Floats, lost: float
         variance = max(float(direction @ covariance @ direction), 0.0) + SYSTEMATIC[name] ** 2
         variance += float(scatter[-1] if name == "resonance" else scatter[int(np.flatnonzero(direction)[0])]) ** 2
         if name in PAIR:
-            # Which bearing or spring takes the energy is not known: it moves a pair that is damped well.
+            # It is unknown which bearing or spring dissipates the energy: this shifts a well damped pair.
             variance += (DAMPED[name] * plant.damping) ** 2
         spread = math.sqrt(variance)
         half = min(reach * spread, _BEYOND)
@@ -487,7 +488,7 @@ def _with_intervals(solution: _Solution, f: Floats, scatter: Floats, lost: float
 
 
 def _checked(name: str, estimate: Estimate) -> Estimate:
-    """Return an estimate, or its refusal if its interval says nothing."""
+    """Return an estimate, or its refusal if its interval is too wide."""
     from tuning.estimate import refused
 
     if not estimate.is_known or (estimate.high - estimate.low) / 2.0 <= WIDEST[name] * abs(estimate.value):

@@ -1,4 +1,4 @@
-"""The step that a measured velocity loop predicts with other gains, of its own set-point and of the position's."""
+"""Predicts steps of velocity and position set-points with other gains from a measured velocity loop."""
 
 from __future__ import annotations
 
@@ -13,14 +13,16 @@ from mechanics.arrays import Complex, Floats, Integers
 if TYPE_CHECKING:
     from tuning.response.measured_loop import MeasuredLoop
 
-LINES = 2.0  # s, one over the distance of the frequencies: what has not died away by then wraps round
+LINES = 2.0  # s, one over the spacing of the frequencies: a response that has not decayed by then wraps round
 SHOWN = 0.25  # s
 
 
 class PredictedStep(NamedTuple):
-    """Answers to a step of 1 at t = 0, without limits and friction; all of shape (n,).
+    """Responses to a step of 1 at t = 0, without limits and friction; all of shape (n,).
 
-    t: [s]. velocity: Of the filtered velocity to its set-point. position: Of the angle to its set-point.
+    t: [s].
+    velocity: Filtered velocity after a step of its set-point.
+    position: Angle after a step of its set-point.
     """
 
     t: Floats
@@ -31,15 +33,15 @@ class PredictedStep(NamedTuple):
 def predicted_step(
     measured: MeasuredLoop, gains: Sequence[int] | Integers, axis: int = 0, shown: float = SHOWN
 ) -> PredictedStep | None:
-    """Return the predicted step with gains, None where a loop would be unstable.
+    """Predict the step with gains; None if a loop would be unstable.
 
-    Where nothing was trusted, and beyond the frequencies that were measured, the fitted model stands.
+    At lines that are not trusted, and beyond the measured frequencies, the fitted model is used.
 
     Args:
-        measured: The velocity loop; a model fits it well.
+        measured: The velocity loop, with a good fit.
         gains: Raw gains, shape (count,).
         axis: Number of the axis.
-        shown: How long [s].
+        shown: Duration [s].
     """
     rate = measured.device.velocity_rate
     whole = measured.extended(np.arange(1, round(rate * LINES / 2.0)) / LINES, axis)
@@ -51,6 +53,6 @@ def predicted_step(
 
 
 def _step(open_loop: Complex) -> Floats:
-    """Return the answer to a step of a loop that integrates, its frequencies those of a discrete Fourier transform."""
+    """Return the step response of an integrating loop at the frequencies of a discrete Fourier transform."""
     closed = open_loop / (1.0 + open_loop)
     return np.asarray(np.cumsum(np.fft.irfft(np.concatenate([[1.0], closed, [0.0]]))))

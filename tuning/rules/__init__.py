@@ -1,1 +1,1 @@
-"""Rules: from an identified axis to gains."""
+"""Rules: compute gains from an identified axis."""

@@ -1,8 +1,8 @@
-"""Classical commissioning, loop by loop: current, velocity, position, each around the closed loop inside it.
+"""Classical commissioning, loop by loop: current, velocity, position, each around the closed inner loop.
 
-Current by the modulus optimum. Velocity by the symmetrical optimum, slowed by the first of these: the lags, half the
-first anti-resonance, or the noise that the encoder's counts put into the current. Position a quarter of the velocity
-loop.
+Current by the modulus optimum. Velocity by the symmetrical optimum, slowed down by the strictest of these: the lags,
+half the first anti-resonance, or the current noise caused by the encoder's resolution. Position at a quarter of the
+velocity loop's crossover.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ if TYPE_CHECKING:
     from drive_env.loops.linear_model import Plant
     from drive_env.motors import Motor
 
-SPREAD = 3.0  # a: 53 degrees of phase margin, what commissioning engineers prefer to the textbook's 37
+SPREAD = 3.0  # a: 53 degrees of phase margin, as commissioning engineers prefer, instead of the textbook's 37
 POSITION = 0.25  # k_v over the velocity loop's crossover
-NOISE = 0.1  # RMS current that the counts may cause, over the rated current
+NOISE = 0.1  # greatest RMS current caused by the encoder's resolution, over the rated current
 
 
 def cascade_rule(device: Device, motor: Motor, plant: Plant) -> Proposal:
-    """Propose gains loop by loop; notes name the limit of the velocity loop."""
+    """Propose gains loop by loop; notes name what limits the velocity loop."""
     bench = Workbench(device, plant)
     lag = take_current(bench, device, plant)
     small = slow_enough(bench, plant, velocity_lag(device, plant, lag), 1.0 / SPREAD)

@@ -1,8 +1,8 @@
-"""IMC and SIMC: controllers that invert the plant's model and ask for one closed-loop time constant.
+"""IMC and SIMC: controllers that invert the plant's model for a wanted closed-loop time constant.
 
 IMC in PI form (Rivera, Morari, Skogestad 1986) for a first-order lag, and Skogestad's SIMC (2003,
-doi:10.1016/S0959-1524(02)00062-8), which counts the dead time, here the sum of the small lags, and shortens the
-integration time so that a load disturbance is worked off too.
+doi:10.1016/S0959-1524(02)00062-8), which accounts for the dead time, here the sum of the small lags, and shortens the
+integration time so that load disturbances are also compensated.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from drive_env.loops.linear_model import Plant
     from drive_env.motors import Motor
 
-# Closed-loop time constants over the dead time, which the rule ignores and must stay clear of.
+# Closed-loop time constants over the dead time, which IMC ignores: the loops must be slower than it.
 IMC_CURRENT = 4.0
 IMC_VELOCITY = 3.0
 
@@ -40,9 +40,9 @@ def simc_integrating(slope: float, dead: float, closed: float) -> PI:
 
 
 def imc_rule(device: Device, motor: Motor, plant: Plant) -> Proposal:
-    """Propose IMC: lags cancelled, closed loops three and four times as slow as the lags that the model leaves out.
+    """Propose IMC: large lags cancelled, closed loops three and four times as slow as the lags that are not modelled.
 
-    An axis that friction hardly holds is a lag of seconds; its integral part is as slow.
+    An axis with little viscous friction has a time constant of seconds; the integral part is then as slow.
     """
     bench = Workbench(device, plant)
     wanted = imc_first_order(1.0 / plant.R, plant.L / plant.R, IMC_CURRENT * current_lag(device))
@@ -61,7 +61,7 @@ def imc_rule(device: Device, motor: Motor, plant: Plant) -> Proposal:
 
 
 def simc_rule(device: Device, motor: Motor, plant: Plant) -> Proposal:
-    """Propose SIMC with closed loops as slow as their dead time, its author's choice of tight and still robust."""
+    """Propose SIMC with closed loops as slow as their dead time, Skogestad's choice for tight but robust control."""
     bench = Workbench(device, plant)
     dead = current_lag(device)
     wanted = simc_first_order(1.0 / plant.R, plant.L / plant.R, dead, dead)
@@ -76,10 +76,10 @@ def simc_rule(device: Device, motor: Motor, plant: Plant) -> Proposal:
 
 
 def simc_position(crossover: float) -> float:
-    """Return k_v [1/s] of the position loop around a velocity loop of this crossover [rad/s].
+    """Return k_v [1/s] of the position loop around a velocity loop with this crossover [rad/s].
 
-    The position is an integrator behind the velocity loop, whose dead time to SIMC is its lag of 1/crossover and what
-    its overshoot adds, half as much again.
+    The position is the integral of the velocity. For SIMC the dead time of the velocity loop is its lag of 1/crossover,
+    and half as much again for its overshoot.
     """
     dead = 1.5 / crossover
     return 1.0 / (2.0 * dead)

@@ -1,4 +1,4 @@
-"""The small lags that rules count, each loop's own, and how slow an elastic load makes a loop."""
+"""The small lags that rules use, loop by loop, and how much an elastic load slows a loop down."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ if TYPE_CHECKING:
     from tuning.rules.proposal import Workbench
 
 ANTI_RESONANCE_SHARE = (
-    0.5  # crossover of a velocity loop over the first anti-resonance, at most: what makers' tools reach
+    0.5  # greatest crossover of a velocity loop over the first anti-resonance, as manufacturers' tools use it
 )
-_RESPONSE = 4096  # samples in which a velocity filter's impulse response has died away, from 5 Hz up
+_RESPONSE = 4096  # samples after which a velocity filter's impulse response has decayed, for corners from 5 Hz
 
 
 def current_lag(device: Device) -> float:
-    """Return the sum of the current loop's small time constants [s]: one PWM period computing, half a one holding."""
+    """Return the sum of the current loop's small time constants [s]: 1 PWM period of computation, 0.5 of hold."""
     return 1.5 / device.current_rate
 
 
@@ -31,8 +31,8 @@ def velocity_lag(device: Device, plant: Plant, current: float) -> float:
 
     Args:
         device: The drive.
-        plant: The axis: its delay, and the corner of its velocity filter.
-        current: The closed current loop as a lag [s].
+        plant: The axis, with its delay and the corner of its velocity filter.
+        current: Time constant of the closed current loop [s].
     """
     return current + plant.delay + 2.0 * VELOCITY_FILTER_DAMPING / (2.0 * math.pi * plant.velocity_filter)
 
@@ -40,7 +40,7 @@ def velocity_lag(device: Device, plant: Plant, current: float) -> float:
 def slow_enough(bench: Workbench, plant: Plant, small: float, share: float) -> float:
     """Return the small time constant, or a larger one with which a crossover of share/small stays below the limit.
 
-    Above half the first anti-resonance, a load on a spring answers for its rotor alone.
+    The limit is half the first anti-resonance: above it, only the rotor follows, not the load on its spring.
     """
     if not math.isfinite(plant.anti_resonance):
         return small
@@ -56,10 +56,10 @@ def slow_enough(bench: Workbench, plant: Plant, small: float, share: float) -> f
 
 
 def velocity_noise(device: Device, plant: Plant) -> float:
-    """Return the RMS noise that the encoder's counts leave in the filtered velocity of a turning axis [rad/s].
+    """Return the RMS noise in the filtered velocity of a turning axis caused by the encoder's resolution [rad/s].
 
-    Positions are off by up to half a count, evenly, from sample to sample at random; velocity is their difference,
-    filtered.
+    Position errors are uniform within half a count and independent from sample to sample; the velocity is their
+    filtered difference.
     """
     from scipy.signal import lfilter
 

@@ -1,8 +1,8 @@
-"""Margin targets: the greatest integers with which every loop keeps its phase and gain margin.
+"""Margin targets: the greatest integers with which every loop keeps a phase and a gain margin.
 
-The pairs are those of a maker's tuning tool, Kollmorgen's Performance Servo Tuner: 45 degrees and 8 dB, and softer
-55/12, 60/20 and 65/35. Integers are searched on the sampled model itself (linear_model.py), so that delay, filter,
-resonance and rounding are all in the margins that are kept.
+The pairs are those of a manufacturer's tuning tool, Kollmorgen's Performance Servo Tuner: 45 degrees and 8 dB, and
+softer 55/12, 60/20 and 65/35. Integers are searched on the sampled model (linear_model.py), so that the margins include
+delay, filter, resonance and rounding.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ if TYPE_CHECKING:
 
 TARGETS = {"margin_45": (45.0, 8.0), "margin_55": (55.0, 12.0), "margin_60": (60.0, 20.0), "margin_65": (65.0, 35.0)}
 
-POINTS = 1200  # frequencies: half a percent apart, so that a weakly damped resonance is not stepped over
+POINTS = 1200  # number of frequencies: half a percent apart, so that no weakly damped resonance is missed
 INTEGRATION = 4.0  # T_i times the velocity loop's crossover: the integral part costs 14 degrees
 CURRENT_P, CURRENT_I = ("current", "P"), ("current", "I")
 VELOCITY_P, VELOCITY_I, POSITION_P = ("velocity", "P"), ("velocity", "I"), ("position", "P")
-STEP = 1.06  # from one trial value of a gain to the next, until the first that fails
+STEP = 1.06  # ratio of successive trial values of a gain, until the first that fails
 
 
 def margin_rule(phase_deg: float, gain_db: float) -> Rule:
@@ -55,7 +55,7 @@ def propose(device: Device, plant: Plant, phase_deg: float, gain_db: float) -> P
     bench = Workbench(device, plant)
 
     def enough(found: Margins) -> bool:
-        # A loop whose gain is below 1 everywhere has all the margin there is.
+        # A loop whose gain is below 1 at all frequencies has an infinite phase margin.
         phase = math.inf if math.isnan(found.phase_deg) else found.phase_deg
         return phase >= phase_deg and found.gain_db >= gain_db
 
@@ -101,7 +101,7 @@ def _greatest(
     phase_deg: float,
     gain_db: float,
 ) -> int:
-    """Return the greatest integer below the first that fails, 1 with a note if that fails itself."""
+    """Return the greatest integer below the first that fails the margins; 1, with a note, if 1 already fails."""
     _, title, _, highest, *_ = bench.row(part)
     last, trial = 0, 1
     while trial <= highest and enough(margins_of(trial)):

@@ -1,9 +1,9 @@
 """Modulus optimum and symmetrical optimum: the current loop by the first, the velocity loop by either.
 
-Both take all small lags together as one time constant T (Kessler 1955, 1958). With a plant k / ((1 + s T_1)(1 + s T))
-the modulus optimum cancels T_1 and leaves a damping of 0.707: 4.3 % overshoot. With k / (s (1 + s T)) the symmetrical
-optimum puts the crossover at 1/(a T), in the middle between 1/(a^2 T) and 1/T: a = 2 has 36.9 degrees of phase margin
-and, without a filter of the set-point, 43.4 % overshoot.
+Both replace all small lags by one time constant T (Kessler 1955, 1958). With a plant k / ((1 + s T_1)(1 + s T)) the
+modulus optimum cancels T_1 and gives a damping of 0.707: 4.3 % overshoot. With k / (s (1 + s T)) the symmetrical
+optimum puts the crossover at 1/(a T), in the middle between 1/(a^2 T) and 1/T: a = 2 gives 36.9 degrees of phase margin
+and, without a set-point filter, 43.4 % overshoot.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ if TYPE_CHECKING:
     from drive_env.motors import Motor
 
 SPREAD = 2.0  # a of the symmetrical optimum
-POSITION = 0.5  # k_v over the velocity loop's crossover: modulus optimum, the velocity loop as one lag
-POSITION_SYMMETRICAL = 0.25  # of a velocity loop that overshoots
+POSITION = 0.5  # k_v over the velocity loop's crossover: modulus optimum with the velocity loop as one lag
+POSITION_SYMMETRICAL = 0.25  # for a velocity loop that overshoots
 
 
 class PI(NamedTuple):
-    """A controller p (1 + 1/(s time)); with an infinite time a proportional one."""
+    """A controller p (1 + 1/(s time)); an infinite time makes it proportional."""
 
     p: float
     time: float
@@ -34,9 +34,9 @@ def modulus_optimum(gain: float, large: float, small: float) -> PI:
     """Return the controller of a plant gain / ((1 + s large)(1 + s small)).
 
     Args:
-        gain: Of the plant [output per input].
-        large: Time constant that is cancelled [s].
-        small: Sum of what remains [s].
+        gain: Gain of the plant [output per input].
+        large: Time constant to cancel [s].
+        small: Sum of the other time constants [s].
     """
     return PI(large / (2.0 * gain * small), large)
 
@@ -55,8 +55,8 @@ def symmetrical_optimum(slope: float, small: float, spread: float = SPREAD) -> P
 def modulus_rule(device: Device, motor: Motor, plant: Plant) -> Proposal:
     """Propose the modulus optimum for all three loops.
 
-    Of an axis without viscous friction the velocity loop has no lag to cancel: it has no integral part then, and a
-    constant load leaves an error.
+    The velocity loop of an axis without viscous friction has no lag to cancel: it then gets no integral part, and a
+    constant load leaves a steady error.
     """
     bench = Workbench(device, plant)
     lag = take_current(bench, device, plant)
@@ -74,21 +74,21 @@ def modulus_rule(device: Device, motor: Motor, plant: Plant) -> Proposal:
 
 
 def symmetrical_rule(device: Device, motor: Motor, plant: Plant) -> Proposal:
-    """Propose the symmetrical optimum for the velocity loop, around a current loop of the modulus optimum."""
+    """Propose the symmetrical optimum for the velocity loop, and the modulus optimum for the current loop."""
     bench = Workbench(device, plant)
     lag = take_current(bench, device, plant)
     small = slow_enough(bench, plant, velocity_lag(device, plant, lag), 1.0 / SPREAD)
     slope = plant.torque_constant / plant.inertia
     reached = bench.p("velocity", symmetrical_optimum(slope, small).p)
     crossover = reached * slope
-    # The integration time keeps its place below the crossover that is reached.
+    # The integration time is relative to the crossover that was reached after rounding.
     bench.time("velocity", SPREAD / crossover)
     bench.p("position", POSITION_SYMMETRICAL * crossover)
     return bench.proposal()
 
 
 def take_current(bench: Workbench, device: Device, plant: Plant) -> float:
-    """Take a current loop of the modulus optimum; return the lag that it is to the loops around it [s]."""
+    """Set the current loop by the modulus optimum; return its lag as seen by the outer loops [s]."""
     found = modulus_optimum(1.0 / plant.R, plant.L / plant.R, current_lag(device))
     reached = bench.p("current", found.p)
     bench.time("current", found.time)

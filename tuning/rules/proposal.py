@@ -1,4 +1,4 @@
-"""The proposal of a rule: raw integers of the device's gains, the wanted values, and those that no integer reaches."""
+"""The proposal of a rule: raw integers of the device's gains, the wanted values, and notes on those that differ."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ if TYPE_CHECKING:
     from drive_env.loops.linear_model import Plant
     from drive_env.motors import Motor
 
-COARSE = 0.05  # a gain that an integer misses by more than this share is worth a note
+COARSE = 0.05  # relative rounding error of a gain from which on a note is added
 
 
 class Proposal(NamedTuple):
     """Gains that a rule proposes.
 
     gains: Raw integers in the order of the device's gain set.
-    wanted: Raw value that the rule asked for, by the gain's name, before it became an integer.
-    notes: What no integer reaches, and which limits were met; for people.
+    wanted: Unrounded raw value of the rule by the gain's name.
+    notes: Values that no integer represents well, and limits that were reached; for users.
     """
 
     gains: tuple[int, ...]
@@ -34,12 +34,12 @@ Rule = Callable[["Device", "Motor", "Plant"], Proposal]
 
 
 class Workbench:
-    """Turns a rule's controllers into integers, the inner loops first, and returns each integer's real value.
+    """Converts a rule's controllers to integers, the inner loops first, and returns each rounded gain in SI units.
 
-    A rule designs a loop, takes its gains here, and designs the next loop around what it got: the integration time and
-    the outer loop follow the bandwidth that is reached, not the one that was wanted.
+    A rule designs a loop, rounds its gains here, and designs the next loop around the rounded one: integration time and
+    outer loop follow the bandwidth that was reached, not the wanted one.
 
-    Loops are "current", "velocity" and "position", as in a device's gain set.
+    Loop names are "current", "velocity" and "position", as in a device's gain set.
 
     Args:
         device: The drive.
@@ -58,22 +58,22 @@ class Workbench:
         self._notes: list[str] = []
 
     def p(self, loop: str, value: float) -> float:
-        """Take a proportional gain [V/A, A*s/rad, 1/s] of a loop; return the value after rounding to an integer."""
+        """Set a proportional gain [V/A, A*s/rad, 1/s] of a loop; return its rounded value."""
         return self._take((loop, "P"), value)
 
     def time(self, loop: str, value: float) -> float:
-        """Take an integration time [s], infinite for none, of the current or velocity loop; return it as rounded."""
+        """Set an integration time [s] of the current or velocity loop, infinity for none; return its rounded value."""
         inverse = self._take((loop, "I"), 1.0 / value)
         return 1.0 / inverse if inverse else math.inf
 
     def raw(self, part: Part, value: int) -> float:
-        """Take an integer that a rule searched itself; return it in SI, of an I 1/s."""
+        """Set an integer that the rule searched itself; return it in SI units, an I gain in 1/s."""
         self._wanted[self._rows[part].name] = float(value)
         self._raw[part] = value
         return self.si(part, value)
 
     def si(self, part: Part, value: float) -> float:
-        """Return a raw gain in SI units, of an I 1/s."""
+        """Convert a raw gain to SI units, an I gain to 1/s."""
         return float(self.scales[part].value(value))
 
     def row(self, part: Part) -> Gain:
@@ -81,7 +81,7 @@ class Workbench:
         return self._rows[part]
 
     def integer(self, part: Part, value: float) -> int:
-        """Return the integer of a gain that is nearest to a value [SI], of an I [1/s]; 1 at least."""
+        """Convert a value [SI, an I gain in 1/s] to the nearest integer of a gain, at least 1."""
         return min(max(round(float(self.scales[part].raw(value))), 1), self._rows[part].highest)
 
     def note(self, text: str) -> None:
@@ -89,12 +89,12 @@ class Workbench:
         self._notes.append(text)
 
     def so_far(self, more: Mapping[Part, int] | None = None) -> tuple[int, ...]:
-        """Return the gains taken so far, and more, in the device's order; the least for a gain that is not taken."""
+        """Return the gains set so far, overridden by `more`, in the device's order; the lowest value for others."""
         found = self._raw | dict(more or {})
         return tuple(found.get(part, row.lowest) for part, row in self._rows.items())
 
     def proposal(self) -> Proposal:
-        """Return the proposal of the gains taken."""
+        """Return the proposal with the gains set so far."""
         return Proposal(self.so_far(), dict(self._wanted), tuple(self._notes))
 
     def _take(self, part: Part, value: float) -> float:

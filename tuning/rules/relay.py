@@ -1,10 +1,10 @@
-"""Relay feedback after Astrom and Hagglund (1984): an axis is made to swing by a relay, and its swing gives the gains.
+"""Relay feedback after Astrom and Hagglund (1984): a relay makes an axis oscillate, which gives the gains.
 
-The relay works in cyclic torque mode: the current is +h or -h by the sign of the velocity's error, once a communication
-cycle, and the axis swings at the frequency where axis, bus and relay together turn the phase by 180 degrees. What is
-evaluated is the axis alone: fundamentals of the recorded velocity and current, whose ratio is a point of its frequency
-response. An axis is an integrator with lags, so the point gives its slope K_t/J and the sum of its lags, and these the
-ultimate gain and period that the drive's own, faster loop has.
+The relay works in cst: the current is +h or -h by the sign of the velocity error, updated once per communication cycle,
+and the axis oscillates at the frequency at which axis, bus and relay together shift the phase by 180 degrees. Only the
+axis is evaluated: the ratio of the fundamentals of recorded velocity and current is a point of its frequency response.
+An axis is an integrator with lags, so the point gives its slope K_t/J and the sum of its lags; from these follow
+ultimate gain and period of the drive's own, faster loop.
 """
 
 from __future__ import annotations
@@ -29,33 +29,36 @@ if TYPE_CHECKING:
     from tuning.target import Target
 
 
-TIME, TRANSIENT = 0.3, 0.1  # of the experiment, and of it what is left out at its beginning [s]
-SHARE = 0.4  # of the rated current: the relay's height
-# Of the drive's current limit, at most: an envelope takes half of it, swung through, for a shaking loop.
+TIME, TRANSIENT = 0.3, 0.1  # s, duration of the experiment, and of the transient omitted at its beginning
+SHARE = 0.4  # relay amplitude over the rated current
+# Greatest relay amplitude over the drive's current limit: to an envelope, a swing of half the limit is an oscillation.
 OF_LIMIT = 0.45
-TRAVEL_SHARE = 0.8  # of the way that there is: beyond it the relay is off
-OFF = 1.5  # factor by which the inertia of the swing may be another than the axis's
-LEAST_COUNTS = 0.5  # of the encoder: the amplitude of a swing that is more than noise
-LEAST_SWINGS = 6  # periods that are worth evaluating
-# The current of a cycle is held for it: recorded at the cycle's end, it acted half a cycle earlier on the mean.
+TRAVEL_SHARE = 0.8  # of the travel: beyond it the relay is off
+OFF = 1.5  # greatest ratio between the inertia seen in the oscillation and the axis'
+LEAST_COUNTS = 0.5  # of the encoder: the smallest amplitude that is more than noise
+LEAST_SWINGS = 6  # smallest number of periods to evaluate
+# The current is held for a cycle: recorded at the cycle's end, it acted half a cycle earlier on average.
 HELD = 0.5 * CYCLE
-# PI gains from the ultimate point (Tyreus, Luyben 1992): half of Ziegler's and Nichols's gain, well damped.
+# PI gains from the ultimate point (Tyreus, Luyben 1992): lower gain and better damping than Ziegler and Nichols.
 GAIN_SHARE, TIME_SHARE = 1.0 / 3.2, 2.2
 POSITION_SHARE = 0.25  # k_v over the velocity loop's crossover
 
 
 class Ultimate(NamedTuple):
-    """Where a P velocity loop would swing: its gain [A*s/rad] and its period [s]."""
+    """The point at which a P velocity loop would oscillate: its gain [A*s/rad] and its period [s]."""
 
     gain: float
     period: float
 
 
 class Swing(NamedTuple):
-    """The swing of every axis under a relay, each of shape (num_axes,); nan and a reason for an axis without one.
+    """The oscillation of every axis under a relay, each of shape (num_axes,); nan and a reason for an axis without one.
 
-    frequency: Of the swing [Hz]. amplitude: Of the velocity [rad/s]. slope: Acceleration per current [rad/(A*s^2)],
-    K_t/J. lag: Sum of the small lags from current to measured velocity [s]. reason: Why there is nothing, else "".
+    frequency: Frequency of the oscillation [Hz].
+    amplitude: Amplitude of the velocity [rad/s].
+    slope: Acceleration per current [rad/(A*s^2)], K_t/J.
+    lag: Sum of the small lags from current to measured velocity [s].
+    reason: Why there is no result; "" with a result.
     """
 
     frequency: Floats
@@ -65,20 +68,20 @@ class Swing(NamedTuple):
     reason: tuple[str, ...]
 
     def ultimate(self, axis: int) -> Ultimate:
-        """Return the ultimate point of an integrator with this slope and a dead time of these lags."""
+        """Return the ultimate point of an integrator with this slope and lag."""
         return ultimate_of_integrator(float(self.slope[axis]), float(self.lag[axis]))
 
 
 def ultimate_of_integrator(slope: float, lag: float) -> Ultimate:
-    """Return the ultimate point of slope e^(-s lag) / s: it swings where the lag turns by 90 degrees."""
+    """Return the ultimate point of slope e^(-s lag) / s: it oscillates where the lag shifts the phase by 90 degrees."""
     w = math.pi / (2.0 * lag)
     return Ultimate(w / slope, 2.0 * math.pi / w)
 
 
 def relay_rule(device: Device, motor: Motor, plant: Plant) -> Proposal:
-    """Propose the gains of a relay experiment on this axis, computed: the ultimate point is the model's.
+    """Propose the gains that a relay experiment on this axis would give, computed from the model.
 
-    `relay_experiment` measures it instead.
+    `relay_experiment` measures the ultimate point instead.
     """
     bench = Workbench(device, plant)
     lag = velocity_lag(device, plant, take_current(bench, device, plant))
@@ -92,13 +95,13 @@ def gains_from_swing(device: Device, plant: Plant, slope: float, ultimate: Ultim
 
     Args:
         device: The drive.
-        plant: The axis; of it the winding and the supply matter, which a relay does not see, and the inertia, by which
-            it is checked that the axis did not swing at its load's resonance.
+        plant: The axis: its winding and supply, which a relay does not measure, and its inertia, by which it is checked
+            that the axis did not oscillate at its load's resonance.
         slope: Acceleration per current [rad/(A*s^2)].
-        ultimate: The point.
+        ultimate: The ultimate point.
 
     Raises:
-        ValueError: If the axis swung like another inertia than its own.
+        ValueError: If the axis oscillated with another inertia than its own.
     """
     expected = plant.torque_constant / plant.inertia
     if not 1.0 / OFF < slope / expected < OFF:
@@ -113,7 +116,7 @@ def gains_from_swing(device: Device, plant: Plant, slope: float, ultimate: Ultim
 
 
 def finish(bench: Workbench, ultimate: Ultimate, slope: float) -> Proposal:
-    """Take velocity and position gains from an ultimate point and return the proposal."""
+    """Set velocity and position gains from an ultimate point, and return the proposal."""
     crossover = bench.p("velocity", GAIN_SHARE * ultimate.gain) * slope
     bench.time("velocity", TIME_SHARE * ultimate.period)
     bench.p("position", POSITION_SHARE * crossover)
@@ -121,9 +124,9 @@ def finish(bench: Workbench, ultimate: Ultimate, slope: float) -> Proposal:
 
 
 def relay_experiment(target: Target) -> Swing:
-    """Swing axes by a relay and evaluate the swing; the drives are enabled in cst meanwhile and off afterwards.
+    """Make axes oscillate by a relay and evaluate the oscillation; the drives are in cst during it and off afterwards.
 
-    The current loop must work: write its gains first. An axis that nears the end of its travel is left alone.
+    The current loop must work: write its gains first. The relay of an axis is switched off near the end of its travel.
     """
     drives, n = target.drives, target.num_axes
     limit = np.minimum(OF_LIMIT * read_current_limit(drives), target.current)
@@ -148,7 +151,8 @@ def relay_experiment(target: Target) -> Swing:
             current[k] = trace[cia402.TORQUE_ACTUAL][0] * per_count
             way = wrapped(trace[cia402.POSITION_ACTUAL][0] - origin)
             inside &= (way > low) & (way < high)
-            # A constant load shifts the swing; what holds it is the mean current that keeps the mean speed at 0.
+            # A constant load shifts the oscillation; the mean current that keeps the mean speed at 0 compensates for
+            # it.
             bias += np.where(inside, -0.02 * height * np.tanh(way / (0.05 * 2.0 * math.pi * scale)), 0.0)
             bias = np.clip(bias, -0.5 * height, 0.5 * height)
             torque = np.where(inside, bias - height * np.sign(speed[k] + (speed[k] == 0.0)), 0.0)
@@ -160,13 +164,13 @@ def relay_experiment(target: Target) -> Swing:
 
 
 def evaluate(speed: Floats, current: Floats, inside: Mask, count_angle: float) -> Swing:
-    """Evaluate recorded swings.
+    """Evaluate recorded oscillations.
 
     Args:
-        speed: Velocity once a cycle [rad/s], shape (n, num_axes).
-        current: Actual current, likewise [A].
-        inside: Which axes kept away from the ends of their travel, shape (num_axes,).
-        count_angle: What a count of the encoder is [rad].
+        speed: Velocity once per cycle [rad/s], shape (n, num_axes).
+        current: Actual current once per cycle [A], shape (n, num_axes).
+        inside: Axes that stayed away from the ends of their travel, shape (num_axes,).
+        count_angle: Angle of one count of the encoder [rad].
     """
     count = speed.shape[1]
     result = {name: np.full(count, math.nan) for name in ("frequency", "amplitude", "slope", "lag")}
@@ -192,7 +196,7 @@ def evaluate(speed: Floats, current: Floats, inside: Mask, count_angle: float) -
             )
             continue
         G = V / amps
-        phase = np.angle(G * 1j)  # beyond the 90 degrees of the integrator
+        phase = np.angle(G * 1j)  # in addition to the 90 degrees of the integrator
         result["frequency"][axis], result["amplitude"][axis] = found, abs(V)
         result["slope"][axis] = abs(G) * w
         lag = -phase / w + HELD
@@ -207,7 +211,7 @@ def evaluate(speed: Floats, current: Floats, inside: Mask, count_angle: float) -
 
 
 def fundamental(x: Floats) -> float:
-    """Return the frequency of the strongest line [Hz], nan for a signal that rests."""
+    """Return the frequency of the strongest line [Hz]; nan for a constant signal."""
     y = (x - x.mean()) * np.hanning(len(x))
     if not np.any(y):
         return math.nan
@@ -221,7 +225,7 @@ def fundamental(x: Floats) -> float:
 
 
 def line(x: Floats, frequency: float) -> complex:
-    """Return the complex amplitude of a line, by least squares with a constant and a slope."""
+    """Return the complex amplitude at a frequency, by least squares with a constant and a slope."""
     t = np.arange(len(x)) * CYCLE
     w = 2.0 * math.pi * frequency * t
     columns = np.stack([np.cos(w), np.sin(w), np.ones_like(t), t], axis=1)

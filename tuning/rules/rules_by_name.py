@@ -1,6 +1,6 @@
-"""The rules by name: from an identified axis to raw integers of its drive's gains.
+"""The rules by name: each computes raw integers of the drive's gains from an identified axis.
 
-A rule proposes; nothing is written.
+A rule only proposes gains; it writes nothing.
 """
 
 from __future__ import annotations
@@ -50,10 +50,11 @@ MEANINGS: Mapping[str, str] = {
 
 
 def propose(name: str, device: Device, motor: Motor, plant: Plant) -> Proposal:
-    """Return the proposal of a rule.
+    """Compute the proposal of a rule.
 
     Raises:
-        ValueError: For an unknown rule, naming those there are, or a drive without a linear model of its loops.
+        ValueError: For an unknown rule (the message lists the known ones), or a drive without a linear model of its
+            loops.
     """
     check_linear_model(device)
     check_rule(name)
@@ -61,6 +62,6 @@ def propose(name: str, device: Device, motor: Motor, plant: Plant) -> Proposal:
 
 
 def check_rule(name: str) -> None:
-    """Raise ValueError for a rule that does not exist, naming those there are."""
+    """Raise ValueError for an unknown rule; the message lists the known ones."""
     if name not in RULES:
         raise ValueError(f"no rule is named {name!r}; there are {', '.join(RULES)}")

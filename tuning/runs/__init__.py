@@ -1,1 +1,1 @@
-"""Runs of many points: sweeps, pools of workers, and the files that they leave."""
+"""Runs of many points: sweeps, pools of workers, and their files."""

@@ -1,4 +1,4 @@
-"""The experiment of a sweep: one TOML, checked key by key before anything runs."""
+"""The experiment of a sweep: one TOML file, checked key by key before anything runs."""
 
 from __future__ import annotations
 
@@ -31,19 +31,19 @@ from tuning.toml_tables import ExperimentError as ExperimentError
 from tuning.toml_tables import as_table, as_value, check_keys, kind_of, read_table, toml, toml_lines
 
 DEFAULT = Path(__file__).parent / "sweep.toml"
-OPEN_LOOP = Path(__file__).parent / "open_loop_sweep.toml"  # of drives without loops
-CLOSED_LOOPS = {  # of those that may close one, by its kind
+OPEN_LOOP = Path(__file__).parent / "open_loop_sweep.toml"  # for drives without loops
+CLOSED_LOOPS = {  # for steppers that can close a loop, by its kind
     LOAD_ANGLE: Path(__file__).parent / "closed_loop_sweep.toml",
     PID_ON_RAMP: Path(__file__).parent / "pid_sweep.toml",
 }
-MAX_POINTS = 4_194_304  # whose table takes 1 GB of memory
-MAX_PER_POINT = 64  # machines that try a point: a shard of 64 points then holds some 4,000
+MAX_POINTS = 4_194_304  # the table then takes 1 GB of memory
+MAX_PER_POINT = 64  # machines per point: a shard of 64 points then has about 4,000
 MAX_DURATION = 60.0  # s
-MIN_SAMPLES = 20  # in each of the two windows; fewer say nothing about ringing
+MIN_SAMPLES = 20  # in each of the two windows; with fewer, ringing cannot be detected
 TARGET_VELOCITY, ACCELERATION = (cia402.TARGET_VELOCITY, 0), (cia402.PROFILE_ACCELERATION, 0)
 _INDEX = re.compile(r"(?:0x)?([0-9a-f]{4})h?:(?:0x)?([0-9a-f]{1,2})h?", re.IGNORECASE)
 _SPACINGS = ("lin", "log")
-_NAMES = ("device", "motor", "load")  # which may be paths
+_NAMES = ("device", "motor", "load")  # their values may be paths
 _PAIRS = (("velocity_rpm", "velocity_pps"), ("acceleration_rpm_per_s", "acceleration_pps2"))
 
 
@@ -58,7 +58,7 @@ class SweptObject:
     spacing: str
 
     def values(self) -> Integers:
-        """Return the raw values in rising order; values that are equal after rounding count once."""
+        """Return the raw values in ascending order; values that are equal after rounding count once."""
         spaced = np.geomspace if self.spacing == "log" else np.linspace
         raw = np.rint(spaced(self.low, self.high, self.count)).astype(np.int64)
         return np.unique(np.clip(raw, self.low, self.high))
@@ -79,17 +79,17 @@ class Excitation:
     acceleration_pps2: float | None = None
 
     def raw_velocity(self, entry: Entry, position_scaler: int, ratio: float = 1.0) -> int:
-        """Return the step as 60FFh wants it, for a scaler [inc/rev] and the rpm of a velocity unit."""
+        """Convert the step to raw units of 60FFh, with the position scaler [inc/rev] and the rpm per velocity unit."""
         return _raw(self.velocity_rpm, self.velocity_pps, entry, position_scaler, ratio)
 
     def raw_acceleration(self, entry: Entry, position_scaler: int, ratio: float = 1.0) -> int:
-        """Return the profile acceleration as 6083h wants it."""
+        """Convert the profile acceleration to raw units of 6083h."""
         return _raw(self.acceleration_rpm_per_s, self.acceleration_pps2, entry, position_scaler, ratio)
 
 
 @dataclass(frozen=True)
 class MetricChoice:
-    """The metric of the ranking, and its weights if it is a combination."""
+    """The metric of the ranking, and its weights if it is a combined one."""
 
     name: str
     weights: Mapping[str, float] = field(default_factory=dict)
@@ -97,12 +97,12 @@ class MetricChoice:
 
 @dataclass(frozen=True)
 class Experiment:
-    """Everything a sweep is: the run repeats from this to the last digit.
+    """All settings of a sweep: a run with equal settings gives identical results.
 
     Attributes:
-        machines: Machines that try each point. One is the default machine; several are drawn by the seed within their
-            parameters' ranges, and a point is as good as the worst of them.
-        versions: Those of an earlier run.
+        machines: Number of machines that try each point. One is the default machine; several are drawn by the seed
+            within their parameters' ranges, and the worst of them counts.
+        versions: Versions recorded by an earlier run.
     """
 
     device: str
@@ -116,9 +116,9 @@ class Experiment:
     versions: Mapping[str, str] = field(default_factory=dict)
 
     def points(self, first: int = 0, last: int | None = None) -> Integers:
-        """Return the grid, or its points from the first to before the last, shape (points, objects).
+        """Return the points of the grid from `first` to before `last`, by default all, shape (points, objects).
 
-        The last object changes fastest.
+        The last object varies fastest.
         """
         numbers = np.unravel_index(np.arange(first, self.size() if last is None else last), self.shape())
         return np.stack([swept.values()[own] for swept, own in zip(self.sweep, numbers, strict=True)], axis=1)
@@ -132,19 +132,19 @@ class Experiment:
         return math.prod(self.shape())
 
     def with_inputs(self) -> Experiment:
-        """Return the experiment with the content of its user's files in place of their paths.
+        """Return the experiment with the content of the user's files instead of their paths.
 
         Raises:
-            ValueError: If one cannot be read, as `inputs.taken` says it.
+            ValueError: If a file cannot be read, as in `inputs.taken`.
         """
         return replace(self, **{name: taken(name, getattr(self, name)) for name in _NAMES})
 
     def inputs(self) -> list[Input]:
-        """Return the files of its user that it has taken."""
+        """Return the user's files that `with_inputs` has read."""
         return inputs_in([getattr(self, name) for name in _NAMES])
 
     def to_toml(self, versions: Mapping[str, str]) -> str:
-        """Return the experiment as TOML: where a run's folder has its inputs, and the versions that ran it."""
+        """Write the experiment as TOML, with the places of inputs in a run's folder, and the versions that ran it."""
         lines = [f"{name} = {toml(as_kept(getattr(self, name)))}" for name in (*_NAMES, "seed", "machines")]
         for swept in self.sweep:
             lines += ["", "[[sweep]]", *toml_lines(swept)]
@@ -160,31 +160,31 @@ class Experiment:
 
 
 class Resolved(NamedTuple):
-    """A checked experiment with its names looked up: device, the swept entries, and raw integers to write."""
+    """A checked experiment with its names resolved: device, swept entries, and raw integers to write."""
 
     device: Device
     entries: tuple[Entry, ...]
     position_scaler: int  # inc/rev
-    velocity: int  # as 60FFh counts it
-    acceleration: int  # as 6083h does
-    velocity_ratio: float = 1.0  # rpm of a velocity unit
-    loop: ClosedLoop | None = None  # that the drives close: some of the swept gains act in it alone
+    velocity: int  # in units of 60FFh
+    acceleration: int  # in units of 6083h
+    velocity_ratio: float = 1.0  # rpm per velocity unit
+    loop: ClosedLoop | None = None  # closed loop of the drives, if swept gains act only in it
 
 
 def load_experiment(
     config: str | Path | None = None, *, closed_loop: str | None = None, **overrides: Any
 ) -> Experiment:
-    """Return the experiment of a TOML file, by default the one that ships, checked.
+    """Read and check an experiment from a TOML file, by default the shipped one.
 
     Args:
         config: The file.
-        closed_loop: Without a file take the one that ships for steppers with a loop of this kind closed.
-        overrides: device, motor, load, seed or machines in place of the file's; None keeps the file's. The experiment
-            that ships sweeps the same gains of any device, over the same range in its units, with the device's usual
-            motor where its own does not suit that device.
+        closed_loop: Without a file, use the shipped one for steppers with a closed loop of this kind.
+        overrides: device, motor, load, seed or machines instead of the file's; None keeps the file's. The shipped
+            experiment sweeps the same gains of any device, over the same range in its units, with the device's usual
+            motor if its own does not fit the device.
 
     Raises:
-        ExperimentError: With the key, its value, the limit and the remedy.
+        ExperimentError: For an invalid key or value; the message has the limit and the remedy.
     """
     path = shipped_experiment(overrides.get("device"), closed_loop=closed_loop) if config is None else Path(config)
     try:
@@ -216,10 +216,10 @@ def load_experiment(
 
 
 def shipped_experiment(device: str | None, *, closed_loop: str | None = None) -> Path:
-    """Return the experiment that ships for a device, None for the default one.
+    """Return the shipped experiment for a device; None selects the default device.
 
     Raises:
-        ExperimentError: For an unknown device, or one that closes no loop where one is wanted.
+        ExperimentError: For an unknown device, or one without the requested closed loop.
     """
     if device is None:
         return CLOSED_LOOPS[closed_loop] if closed_loop else DEFAULT
@@ -238,10 +238,10 @@ def shipped_experiment(device: str | None, *, closed_loop: str | None = None) ->
 
 
 def resolve(experiment: Experiment) -> Resolved:
-    """Look an experiment's names up, and check its values against the device.
+    """Resolve an experiment's names, and check its values against the device.
 
     Raises:
-        ExperimentError: For a name that does not exist, or a value beyond its limits.
+        ExperimentError: For an unknown name, or a value beyond its limits.
     """
     try:
         device, motor = find_device(experiment.device), find_motor(experiment.motor)
@@ -281,7 +281,7 @@ def resolve(experiment: Experiment) -> Resolved:
 
 
 def _loop_of(device: Device, sweep: tuple[SweptObject, ...], entries: tuple[Entry, ...]) -> ClosedLoop | None:
-    """Return the loop that a sweep closes: a name tells it, an object the first in which it acts."""
+    """Return the closed loop of a sweep: that of a gain's name, or the first of a swept object; None if open."""
     known = device.gains
     try:
         loop = known.loop_of([swept.object for swept in sweep])
@@ -294,7 +294,7 @@ def _loop_of(device: Device, sweep: tuple[SweptObject, ...], entries: tuple[Entr
 
 
 def _position_scale(device: Device, dictionary: ObjectDictionary, preset: Mapping[str, int]) -> int:
-    """Return the increments of a revolution as a drive has them that was commissioned with a preset."""
+    """Return the increments per revolution of a drive that was commissioned with a preset."""
     scale = position_scale(device.roles)
     if scale is None:
         raise ExperimentError(f"{device.name} does not say how many increments a turn has, in its roles.toml")
@@ -302,13 +302,13 @@ def _position_scale(device: Device, dictionary: ObjectDictionary, preset: Mappin
 
 
 def _velocity_ratio(device: Device, dictionary: ObjectDictionary, preset: Mapping[str, int]) -> float:
-    """Return the rpm of a velocity unit of such a drive; 1 of one that has no such unit."""
+    """Return the rpm per velocity unit of such a drive; 1 for a drive without such a unit."""
     scale = velocity_ratio(device.roles)
     return 1.0 if scale is None else _made(scale, dictionary, preset)
 
 
 def _made(scale: PositionScale, dictionary: ObjectDictionary, preset: Mapping[str, int]) -> float:
-    """Return the scale that a preset gives, with defaults for objects that it lacks."""
+    """Compute a scale from a preset, with defaults for objects that it lacks."""
     given = {dictionary.find(name).label: value for name, value in preset.items()}
     entries = [dictionary.find(key) for key in scale.keys]
     values = [np.array([given.get(entry.label, entry.default)], float) for entry in entries]
@@ -316,7 +316,7 @@ def _made(scale: PositionScale, dictionary: ObjectDictionary, preset: Mapping[st
 
 
 def _same_gains(experiment: Experiment, name: str) -> tuple[SweptObject, ...]:
-    """Return the gains of an experiment for another device: its gains of the same parts, in its units."""
+    """Return an experiment's gains for another device: its gains of the same parts, converted to its units."""
     try:
         device = find_device(name)
     except ValueError as error:
@@ -353,7 +353,7 @@ def gain_objects(device: Device, dictionary: ObjectDictionary) -> list[Entry]:
 
 
 def label(entry: Entry) -> str:
-    """Return index and sub-index as tables show them, e.g. `2042h:01`."""
+    """Format index and sub-index as in tables, e.g. `2042h:01`."""
     return f"{entry.index:04X}h:{entry.sub:02X}"
 
 
@@ -458,14 +458,14 @@ def _is_multiple(value: float, unit: float) -> bool:
 
 
 def _raw(in_rpm: float | None, in_pps: float | None, entry: Entry, position_scaler: int, ratio: float) -> int:
-    """Return a speed in rpm or pps, or an acceleration in rpm/s or pps^2, as the object counts it."""
+    """Convert a speed in rpm or pps, or an acceleration in rpm/s or pps^2, to the object's units."""
     value = in_rpm * position_scaler / 60.0 if in_rpm is not None else in_pps
     assert value is not None, "the parser lets exactly one through"
     return round(value * per_increment_of(entry.unit, position_scaler, ratio))
 
 
 def _default_weights(name: str, sweep: tuple[SweptObject, ...]) -> Mapping[str, float]:
-    """Return the weights of the combined metric; those of a servo drive where names are wrong, which `resolve` says."""
+    """Return the weights of the combined metric; a servo's for invalid names, which `resolve` reports later."""
     try:
         device = find_device(name)
         dictionary = device.new_dictionary()
@@ -477,7 +477,7 @@ def _default_weights(name: str, sweep: tuple[SweptObject, ...]) -> Mapping[str, 
 
 # --- the TOML ---------------------------------------------------------------------------------------------------------
 def _parse(data: Mapping[str, Any]) -> Experiment:
-    """Return the experiment of TOML data; keys and types are checked, names and limits are not."""
+    """Convert TOML data to an experiment; checks keys and types, but neither names nor limits."""
     check_keys("the experiment", data, [f.name for f in fields(Experiment)], optional={"machines", "versions"})
     tables = data["sweep"]
     if not isinstance(tables, list):

@@ -1,8 +1,8 @@
-"""A run's files from its user: kept in its folder by content, known by a hash, and sent along with its work.
+"""The user's files of a run: stored in its folder by content, identified by a hash, and sent along with its work.
 
-A motor, load, device, set of distributions or suite of one's own is a path. What lies there may be edited while a run
-is stopped, and a worker may have another file of that name. So a run reads it once: from then on its `Input` is what is
-opened, wherever the work is done. Names of what ships are no inputs: the hash of the sources covers them.
+A user's own motor, load, device, set of distributions or suite is given as a path. The file may be edited while a run
+is stopped, and a worker may have another file of the same name. So a run reads it once: from then on its `Input` is
+opened, wherever the work is done. Shipped names are no inputs: the hash of the sources covers them.
 """
 
 from __future__ import annotations
@@ -21,26 +21,26 @@ from typing import Any
 
 from mechanics.reading.untrusted import TooLargeError, read_bytes
 
-FOLDER = "inputs"  # of a run
-MOST_BYTES = 64_000_000  # of an input with all its files: it travels with each task
+FOLDER = "inputs"  # in a run's folder
+MOST_BYTES = 64_000_000  # of an input with all its files: it is sent with each task
 _KEPT = re.compile(rf"{FOLDER}/[a-z]+(?:/[^/\\\0]+)+")
 
 
 class InputError(ValueError):
-    """A file that a run cannot keep, or that has changed since the run was begun; one line with its remedy."""
+    """A file that a run cannot store, or that has changed since the run began; one line with its remedy."""
 
 
 class Input(str):
-    """The path of this process's own copy of a user's file.
+    """The path of this process' own copy of a user's file.
 
-    Pickled, it is its content: where it is unpickled a copy is made, and no file is looked for.
+    Pickling stores the content: unpickling writes a new copy, without access to the original file.
 
     Attributes:
         given: The path as the user gave it, for messages.
-        kept: Where a run's folder has it, e.g. `inputs/motor/mine.toml`.
+        kept: Its place in a run's folder, e.g. `inputs/motor/mine.toml`.
         hash: SHA-256 over the names and contents of its files.
-        files: Path -> content, relative to `inputs/<what>`; empty where only the hash is known, of an agent file
-            that was moved without what lay beside it.
+        files: Path -> content, relative to `inputs/<what>`; empty if only the hash is known, as for an agent file that
+            was moved without its inputs.
     """
 
     __slots__ = ("files", "given", "hash", "kept")
@@ -50,7 +50,7 @@ class Input(str):
     files: Mapping[str, bytes]
 
     def __new__(cls, what: str, given: str, main: str, files: Mapping[str, bytes], recorded: str = "") -> Input:
-        """Return the path of the copy, which is written if this process has none; `main` is the file, or the folder."""
+        """Create the path of the copy, and write it if this process has none; `main` is the file, or the folder."""
         own = recorded if not files else _hash(main, files)
         path = Path(given) if not files else _copy(f"{own[:16]}/{what}", files) / main
         made = super().__new__(cls, path)
@@ -60,7 +60,7 @@ class Input(str):
 
     @property
     def what(self) -> str:
-        """Its kind: motor, load ..."""
+        """Its kind: "motor", "load" ..."""
         return self.kept.split("/")[1]
 
     @property
@@ -69,68 +69,68 @@ class Input(str):
         return self.kept.split("/", 2)[2]
 
     def __reduce__(self) -> Any:
-        """Travel as content."""
+        """Pickle the content."""
         return Input, (self.what, self.given, self.main, dict(self.files), self.hash)
 
     def __copy__(self) -> Input:
-        """Stay the same: it is a constant."""
+        """Return itself: it is constant."""
         return self
 
     def __deepcopy__(self, memo: object) -> Input:
-        """Stay the same."""
+        """Return itself."""
         return self
 
     def __repr__(self) -> str:
-        """Return its name and hash, wherever its copy lies."""
+        """Show its place and hash, independently of the place of its copy."""
         return f"Input({self.kept!r}, {self.hash!r})"
 
 
 def taken(what: str, name: Any, also: Iterable[Path] = ()) -> Any:
-    """Return a name as it is, or an `Input` if it is the path of a file or folder.
+    """Return an `Input` for the path of a file or folder, and any other name unchanged.
 
     Args:
         what: A key of `_FILES`.
-        name: As `find_motor`, `find_load`, `find_device` and `Distributions.load` take it.
-        also: Further files that belong to it, as those that a suite names.
+        name: As in `find_motor`, `find_load`, `find_device` and `Distributions.load`.
+        also: Further files that belong to it, such as those that a suite names.
 
     Raises:
-        InputError: If a file of it cannot be read, or lies where the run's copy would not have it.
-        ValueError: If it is no such thing.
+        InputError: If one of its files cannot be read, or lies where the copy cannot have it.
+        ValueError: If it is not of this kind.
     """
     if isinstance(name, Input) or not isinstance(name, str | Path) or not is_path(what, str(name)):
         return name
-    _check(what, name)  # with the user's path in the message
+    _check(what, name)  # so that messages have the user's path
     return _read(what, Path(name), str(name), also)
 
 
 def files_of(what: str, path: Path) -> list[Path]:
-    """Return the files that are read for the one at a path; raises as `taken`."""
+    """Return the files that belong to the one at a path; raises as `taken`."""
     return _FILES[what](path)
 
 
 def taken_options(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return options with inputs in place of the paths among them, by their keys."""
+    """Return options with inputs instead of paths, by their keys."""
     return {key: taken(key, value) if key in _FILES else value for key, value in options.items()}
 
 
 def inputs_in(value: Any) -> list[Input]:
-    """Return the inputs among values, in tables and lists within them too."""
+    """Return the inputs among values, also in nested tables and lists."""
     return list({one.kept: one for one in _walk(value)}.values())
 
 
 def hashes(inputs: Iterable[Input]) -> dict[str, str]:
-    """Return the table of inputs in settings: place in the folder -> hash."""
+    """Return the table of inputs for settings: place in the folder -> hash."""
     return {one.kept: one.hash for one in inputs}
 
 
 def table_of(inputs: Iterable[Input]) -> list[str]:
-    """Return the lines of settings that say the same as a table; none without inputs."""
+    """Return the lines of the table of inputs in settings; empty without inputs."""
     lines = [f'{json.dumps(place)} = "{own}"' for place, own in hashes(inputs).items()]
     return ["", "[inputs]", *lines] if lines else []
 
 
 def as_kept(value: Any) -> Any:
-    """Return values with the places in a run's folder for inputs, in tables and lists within them too."""
+    """Replace inputs by their places in a run's folder, also in nested tables and lists."""
     if isinstance(value, Input):
         return value.kept
     if isinstance(value, Mapping):
@@ -141,7 +141,7 @@ def as_kept(value: Any) -> Any:
 
 
 def found_in(value: Any, folder: Path) -> Any:
-    """Return values with whole paths of a run's own copies for inputs, for a file that is read from elsewhere."""
+    """Replace inputs by absolute paths in a run's folder, for a file that is read from elsewhere."""
     if isinstance(value, Input):
         return str(folder.absolute() / value.kept)
     if isinstance(value, Mapping):
@@ -151,7 +151,7 @@ def found_in(value: Any, folder: Path) -> Any:
 
 def write_inputs(folder: Path, inputs: Iterable[Input]) -> None:
     """Write inputs into a run's folder; raises OSError with the file and the reason."""
-    from drive_env.whole_file import write_whole  # not with the module: acting with an agent's file needs NumPy alone
+    from drive_env.whole_file import write_whole  # here, since acting with an agent's file needs NumPy only
 
     for one in inputs:
         for name, content in one.files.items():
@@ -159,16 +159,16 @@ def write_inputs(folder: Path, inputs: Iterable[Input]) -> None:
 
 
 def found_again(value: Any, recorded: Any, folder: Path, *, alone: bool = False) -> Any:
-    """Return values with the inputs that a run's folder has in the places of their names.
+    """Replace places in a run's folder by the inputs stored there.
 
     Args:
-        value: A name, or a table of some.
-        recorded: What the settings say of the inputs, by `hashes`.
-        folder: The run's.
-        alone: Whether it may have been moved away from them: an input that is not there then has no content.
+        value: A name, or a table of names.
+        recorded: The table of inputs in the settings, as written by `hashes`.
+        folder: The run's folder.
+        alone: Whether the settings may have been moved without the inputs: a missing input then has no content.
 
     Raises:
-        InputError: If one is not there, or is not the one that the run had.
+        InputError: If an input is missing, or differs from the recorded one.
     """
     if isinstance(value, Mapping):
         return {key: found_again(one, recorded, folder, alone=alone) for key, one in value.items()}
@@ -190,12 +190,12 @@ def found_again(value: Any, recorded: Any, folder: Path, *, alone: bool = False)
 
 
 def check_unchanged(recorded: Any, inputs: Iterable[Input], place: Path) -> None:
-    """Raise InputError, with the file and the remedies, if a run that is stopped had an input with other content.
+    """Raise InputError, with the file and the remedies, if an input of a stopped run has changed.
 
     Args:
-        recorded: What its settings say of its inputs.
-        inputs: Those now.
-        place: Where it is kept.
+        recorded: The table of inputs in its settings.
+        inputs: The present ones.
+        place: The folder of the stopped run.
     """
     if not isinstance(recorded, Mapping):
         return
@@ -224,15 +224,15 @@ def _changed(one: Input, place: Path) -> str:
 
 
 def forget_copies() -> None:
-    """Remove this process's copies, as its end does: before an end that runs nothing (os._exit)."""
+    """Remove this process' copies; needed before an exit without cleanup (os._exit)."""
     with _LOCK:
         if _COPIES and _COPIES[0][0] == os.getpid():
             shutil.rmtree(_COPIES.pop()[1], ignore_errors=True)
 
 
-# --- which files there are --------------------------------------------------------------------------------------------
+# --- the files of an input --------------------------------------------------------------------------------------------
 def is_path(what: str, name: str) -> bool:
-    """Return whether a name is the path of a file, or of a device's folder, as `find_motor` and its like read it."""
+    """Return whether a name is the path of a file, or of a device's folder, as `find_motor` and similar take it."""
     if is_shipped(what, name):
         return False
     if what == "device":
@@ -247,16 +247,16 @@ def is_path(what: str, name: str) -> bool:
 
 
 def is_shipped(what: str, name: str) -> bool:
-    """Return whether a name ships, whatever lies in the present folder."""
+    """Return whether a name is a shipped one, even if the present folder has a file of this name."""
     if what == "device":
         from drive_env.devices import device_names
 
         return name in device_names()
-    return False  # other names that ship end otherwise than paths do
+    return False  # other shipped names end differently from paths
 
 
 def _check(what: str, name: str | Path) -> None:
-    """Raise ValueError, with the path as it is given, for a file that is not of this kind."""
+    """Raise ValueError, with the path as given, for a file that is not of this kind."""
     if what == "motor":
         from drive_env.motors import find_motor
 
@@ -276,7 +276,7 @@ def _check(what: str, name: str | Path) -> None:
 
 
 def _read(what: str, path: Path, given: str, also: Iterable[Path] = ()) -> Input:
-    """Return the input at a path, all its files read once."""
+    """Read the input at a path, all its files once."""
     try:
         paths = [_whole(one) for one in (*_FILES[what](path), *also)]
         top = _whole(path)
@@ -302,12 +302,12 @@ def _read(what: str, path: Path, given: str, also: Iterable[Path] = ()) -> Input
 
 
 def _whole(path: Path) -> Path:
-    """Return a whole path without `..`; links are not followed, since they keep their names in a copy."""
+    """Make a path absolute and remove `..`; links are not resolved, since a copy keeps their names."""
     return Path(os.path.abspath(path))  # noqa: PTH100
 
 
 def _top(one: Input) -> Path:
-    """Return the folder of a copy that its files' paths are relative to."""
+    """Return the folder of a copy to which its files' paths are relative."""
     return Path(one).parents[len(PurePosixPath(one.main).parts) - 1]
 
 
@@ -326,7 +326,7 @@ def _of_load(path: Path) -> list[Path]:
 
 
 def _of_device(path: Path) -> list[Path]:
-    """Return the files of a variant, or of a device's folder; other files in the folder are left out."""
+    """Return the files of a variant, or the used files of a device's folder."""
     if not path.is_dir():
         return [path]
     from drive_env.devices.own_folder import own_data
@@ -338,22 +338,22 @@ def _of_device(path: Path) -> list[Path]:
 _FILES = {"motor": _alone, "distributions": _alone, "load": _of_load, "device": _of_device, "suite": _alone}
 
 # --- copies -----------------------------------------------------------------------------------------------------------
-_LOCK = threading.RLock()  # Ctrl-C may come while it is held, and removes the copies
-_COPIES: list[tuple[int, Path]] = []  # the process and its folder
-_GIVEN: dict[str, str] = {}  # path of a copy -> as the user gave it
+_LOCK = threading.RLock()  # reentrant: Ctrl-C may arrive while it is held, and removes the copies
+_COPIES: list[tuple[int, Path]] = []  # process and its folder
+_GIVEN: dict[str, str] = {}  # path of a copy -> path as the user gave it
 
 
 def as_given(text: str) -> str:
-    """Return a message with the paths that the user gave in place of those of this process's copies."""
+    """Replace paths of this process' copies in a message by those that the user gave."""
     for copy, given in _GIVEN.items():
         text = text.replace(copy, given)
     return text
 
 
 def _copy(place: str, files: Mapping[str, bytes]) -> Path:
-    """Return where this process has its copy of files."""
+    """Write files to this process' folder unless they are there, and return their folder."""
     with _LOCK:
-        if not _COPIES or _COPIES[0][0] != os.getpid():  # another process's, of which this one is a fork
+        if not _COPIES or _COPIES[0][0] != os.getpid():  # the copies of a parent process, if this one is a fork
             if not _COPIES:
                 atexit.register(forget_copies)
             _COPIES[:] = [(os.getpid(), Path(tempfile.mkdtemp(prefix="drive-env-inputs-")))]

@@ -1,6 +1,6 @@
-"""The metrics of a sweep's points: their table, and the combined one that ranks by default.
+"""The metrics of a sweep's points: their tables, and the combined metrics that rank by default.
 
-Speeds are in rpm, as drive engineers read them. For every metric less is better; one that does not exist (never
+Speeds are in rpm, as drive engineers use them. For every metric smaller is better; one that does not exist (never
 settles) is nan.
 """
 
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     from drive_env.devices.gain_set import ClosedLoop
 
 
-# A current that swings by this share of the limit without decaying is a limit cycle; noise at usable gains stays below
+# A current that swings by this share of its limit without decaying is a limit cycle; noise at usable gains stays below
 # 0.03.
 RINGING_CURRENT = 0.2
-# Encoder noise at good gains reaches 10 % of the dip, and would keep an axis from ever recovering.
+# Encoder noise at good gains reaches 10 % of the dip; with a smaller band an axis would never recover.
 RECOVERY_BAND = 0.2
 
 
@@ -36,16 +36,16 @@ class MoveRecording(NamedTuple):
     current_limit: Floats  # A, shape (p,)
     t_step: float  # s
     t_load: float  # s
-    # Of a stepper: demand less encoder [full steps], shape (n, p). In open loop the mean square of the run current that
-    # is set over the motor's rated one, shape (p,); in closed loop the full steps of a revolution, shape (p,). In open
-    # loop and by a PID no torque current is measured: current and its limit are nan.
+    # Steppers only: demand less encoder [full steps], shape (n, p). In open loop the mean square of the set run current
+    # over the motor's rated one, shape (p,); in closed loop the full steps per revolution, shape (p,). In open loop and
+    # with a PID no torque current is measured: current and its limit are nan.
     lag: Floats | None = None
     effort: Floats | None = None
     full_steps: Floats | None = None
 
     @property
     def is_open_loop(self) -> bool:
-        """Whether no loop is closed around the motor."""
+        """Whether the motor runs in open loop."""
         return self.effort is not None
 
     @property
@@ -66,18 +66,18 @@ class MoveRecording(NamedTuple):
 
 
 class Figures(NamedTuple):
-    """The figures of a recording by response.py; errors [rpm] are set-point less actual."""
+    """The results of response.py for a recording; errors [rpm] are set-point less actual."""
 
     recording: MoveRecording
     step: response.StepMetrics
     disturbance: response.DisturbanceMetrics
-    current: response.CurrentMetrics | None  # None where no torque current is measured
+    current: response.CurrentMetrics | None  # None if no torque current is measured
     step_error: Floats  # shape (samples, p), from the step to the load step
-    load_error: Floats  # shape (samples, p), from the load step on
+    load_error: Floats  # shape (samples, p), from the load step to the end
 
 
 class Metric(NamedTuple):
-    """A row: name, unit, meaning, and the function from figures to one number per point, shape (p,)."""
+    """A metric: name, unit, meaning, and its function from figures to one number per point, shape (p,)."""
 
     name: str
     unit: str
@@ -86,7 +86,7 @@ class Metric(NamedTuple):
 
 
 def figures(recording: MoveRecording) -> Figures:
-    """Return the figures of a recording: the step up to the load torque, the disturbance from there to the end."""
+    """Evaluate a recording: the step until the load torque, then the disturbance until the end."""
     t, speed = recording.t, recording.speed_rpm
     reference = np.broadcast_to(recording.reference_rpm[:, None], speed.shape)
     error = reference - speed
@@ -104,9 +104,9 @@ def figures(recording: MoveRecording) -> Figures:
 
 
 def oscillates(found: Figures) -> Mask:
-    """Return which points ring without decaying, in the velocity or in the current, shape (p,)."""
+    """Return which points ring without decaying, in velocity or current, shape (p,)."""
     recording = found.recording
-    if not recording.measures_current:  # there is no current to swing
+    if not recording.measures_current:  # no measured current that could ring
         return np.asarray(found.step.oscillating)
     window = slice(_index(recording.t, recording.t_step), _index(recording.t, recording.t_load) + 1)
     ringing, _ = response.oscillation(
@@ -120,7 +120,7 @@ def oscillates(found: Figures) -> Mask:
 def ripple(found: Figures) -> Floats:
     """Return the RMS change of the current from sample to sample [A], over the second half of the step's window.
 
-    Noise that the gains amplify, and ringing that hardly decays: it grows as the limit of stability comes near.
+    It contains amplified noise and ringing that hardly decays: it grows near the stability limit.
     """
     recording = found.recording
     first, load = _index(recording.t, recording.t_step), _index(recording.t, recording.t_load)
@@ -129,17 +129,17 @@ def ripple(found: Figures) -> Floats:
 
 
 def tracking(found: Figures, weights: Mapping[str, float]) -> Floats:
-    """Return the combined metric [s]: how far from its set-point the axis stays, and how rough its current is.
+    """Return the combined metric [s] of the axis' distance from its set-point and the roughness of its current.
 
     tracking = step * IAE_step / |h| + disturbance * IAE_load / |h| + ripple * i_ripple / i_max
 
-    h is the height of the velocity step, IAE_step the integral of |set-point - actual| up to the load torque step,
+    h is the height of the velocity step, IAE_step the integral of |set-point - actual| until the load torque step,
     IAE_load the same from there to the end, i_ripple the metric `ripple` and i_max the drive's current limit. The first
-    two are seconds of full error; the weight of the third [s] is what a ripple of the whole current limit would cost:
-    with 0.2 s, one percent of it is worth 2 ms. In open loop the third term is
-    effort * (i/i_rated)^2 of the run current. In closed loop the first two are the means of |demand - encoder| in the
-    same times over the height: by how many seconds the axis is behind. A PID of a stepper measures no torque current:
-    its third term is vibration * the RMS change of demand - encoder per sample [full steps].
+    two are seconds of full error; the weight of the third [s] is the cost of a ripple of the whole current limit: with
+    0.2 s, one percent of it costs 2 ms. In open loop the third term is effort * (i/i_rated)^2 of the run current. In
+    closed loop the first two are the means of |demand - encoder| in the same times over the height: the seconds by
+    which the axis is behind. With the PID of a stepper no torque current is measured: the third term is vibration * the
+    RMS change of demand - encoder per sample [full steps].
     """
     recording, load = found.recording, len(found.step_error) - 1
     height = abs(float(recording.reference_rpm[-1]))
@@ -157,7 +157,7 @@ def tracking(found: Figures, weights: Mapping[str, float]) -> Floats:
 
 
 def score(name: str, weights: Mapping[str, float], found: Figures) -> Floats:
-    """Return the metric that ranks, plain or combined, shape (p,)."""
+    """Return the metric of the ranking, plain or combined, shape (p,)."""
     if name == TRACKING.name:
         return tracking(found, weights)
     return (METRICS | OPEN_LOOP_METRICS | CLOSED_LOOP_METRICS)[name].function(found)
@@ -176,7 +176,7 @@ def _disturbance_iae(found: Figures) -> Floats:
 
 
 def _behind(found: Figures, window: slice) -> Floats:
-    """Return the mean of |demand - encoder| over the height of the step [s], in samples from the step on."""
+    """Return the mean of |demand - encoder| over the height of the step [s]; the window begins at the step."""
     recording = found.recording
     assert recording.full_steps is not None, "a closed loop has a scale of full steps"
     height = abs(float(recording.reference_rpm[-1])) / 60.0 * recording.full_steps
@@ -194,7 +194,7 @@ def _rms_current(found: Figures) -> Floats:
 
 
 def _index(t: Floats, time: float) -> int:
-    """Return the sample at a time [s]; times are whole sampling periods."""
+    """Return the index of the sample at a time [s], a whole number of sampling periods."""
     return int(np.abs(t - time).argmin())
 
 
@@ -218,7 +218,7 @@ METRICS: dict[str, Metric] = {
 }  # fmt: skip
 
 
-# Of an open loop: no figure of a measured current, and what encoder, step counter and settings say.
+# Open loop: no metrics of a measured current, but those of encoder, step counter and settings.
 OPEN_LOOP_METRICS: dict[str, Metric] = {
     name: row for name, row in METRICS.items() if name not in ("peak_current", "rms_current", "ripple")
 } | {
@@ -234,7 +234,7 @@ OPEN_LOOP_METRICS: dict[str, Metric] = {
 }  # fmt: skip
 
 
-# Of a stepper whose loop is closed: 6077h is its torque current, and the load angle a following error.
+# Stepper with closed loop: 6077h is its torque current, and the load angle is a following error.
 CLOSED_LOOP_METRICS: dict[str, Metric] = METRICS | {
     row.name: row
     for row in (
@@ -246,7 +246,7 @@ CLOSED_LOOP_METRICS: dict[str, Metric] = METRICS | {
 }  # fmt: skip
 
 
-# Of one whose position a PID regulates: no torque current is measured.
+# Stepper whose position a PID controls: no torque current is measured.
 PID_METRICS: dict[str, Metric] = {
     name: row for name, row in CLOSED_LOOP_METRICS.items() if name not in ("peak_current", "rms_current", "ripple")
 } | {"vibration": OPEN_LOOP_METRICS["vibration"]._replace(
@@ -265,7 +265,7 @@ def _lag(found: Figures) -> Floats:
 
 
 class Combined(NamedTuple):
-    """The row of a combined metric: its weights, with their defaults."""
+    """A combined metric with the default weights."""
 
     name: str
     unit: str
@@ -302,14 +302,14 @@ PID_TRACKING = TRACKING._replace(
 
 
 def metrics_of(device: Device, loop: ClosedLoop | None = None) -> dict[str, Metric]:
-    """Return the metrics that a device's drives can show in a sweep with a loop closed that a stepper may close."""
+    """Return the metrics of a device in a sweep; `loop` is the stepper loop that is closed, None without one."""
     if loop is not None:
         return PID_METRICS if loop.is_pid else CLOSED_LOOP_METRICS
     return OPEN_LOOP_METRICS if device.gains.is_open_loop else METRICS
 
 
 def combined_of(device: Device, loop: ClosedLoop | None = None) -> Combined:
-    """Return the combined metric of such a sweep."""
+    """Return the combined metric of a device in a sweep; `loop` as in `metrics_of`."""
     if loop is not None:
         return PID_TRACKING if loop.is_pid else CLOSED_LOOP_TRACKING
     return OPEN_LOOP_TRACKING if device.gains.is_open_loop else TRACKING
@@ -321,5 +321,5 @@ def unit_of(name: str) -> str:
 
 
 def metric_names(device: Device, loop: ClosedLoop | None = None) -> list[str]:
-    """Return the names of all metrics of such a sweep, the combined one first."""
+    """Return the names of all metrics of a device in a sweep, the combined one first."""
     return [TRACKING.name, *metrics_of(device, loop)]

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from tuning.runs.sweep import SweepResult
 
 NO_FIGURE = "#f8ddc4"
-# Why a point is not usable, worst first: a column of the table, its colour, its name in the legend.
+# Why a point has no score, worst first: column of the table, colour, and name in the legend.
 REASONS = (
     ("diverged", "#3a3a3a", "diverged"),
     ("fault", "#9a9a9a", "in fault"),
@@ -41,9 +41,9 @@ DPI = 150
 
 
 def heat_map(result: SweepResult) -> Figure:
-    """Return the score over the grid: a line for one swept object, a map for two.
+    """Draw the score over the grid: a line for one swept object, a map for two.
 
-    With more objects the map is over the first two, each cell showing the best over the others.
+    With more objects the map is over the first two, and each cell shows the best over the others.
     """
     figure = Figure(figsize=(8.0, 6.0), dpi=DPI, layout="constrained")
     axes = figure.add_subplot()
@@ -56,7 +56,7 @@ def heat_map(result: SweepResult) -> Figure:
 
 
 def best_response(result: SweepResult) -> Figure:
-    """Return set-point and velocity, current and load torque of the best point over time."""
+    """Draw set-point and velocity, current and load torque of the best point over time."""
     recording, excitation = result.response, result.experiment.excitation
     figure = Figure(figsize=(8.0, 7.0), dpi=DPI, layout="constrained")
     speed, current, load = figure.subplots(3, 1, sharex=True, height_ratios=(3, 2, 1))
@@ -87,7 +87,7 @@ def best_response(result: SweepResult) -> Figure:
 
 
 def _draw_current(current: Axes, t: Floats, recording: MoveRecording) -> None:
-    """Draw the measured current, and its limit where it comes near."""
+    """Draw the measured current, and its limit if the current comes close to it."""
     current.plot(t, recording.current[:, 0], color="#d55e00", linewidth=1.2, label="actual current")
     limit = float(recording.current_limit[0])
     if np.abs(recording.current[:, 0]).max() > 0.7 * limit:
@@ -155,7 +155,7 @@ def _map(figure: Figure, axes: Axes, result: SweepResult) -> None:
     first, second = result.experiment.sweep[:2]
     factor, text = _scale(result)
     shape = result.experiment.shape()
-    # The best over the other objects; a cell in which every one fails is unusable.
+    # The best over the other objects; a cell has no score if all its points have none.
     score = factor * result.score.reshape(*shape[:2], -1).min(axis=2)
     valued = np.isfinite(score)
     x, y = _edges(first), _edges(second)
@@ -197,12 +197,12 @@ def _legend(axes: Axes, result: SweepResult) -> None:
 
 
 def _colours() -> list[str]:
-    """Return the colours of points without a score, by the numbers that `_reasons` gives."""
+    """Return the colours of points without a score, by the numbers of `_reasons`."""
     return [NO_FIGURE, *(colour for _, colour, _ in reversed(REASONS))]
 
 
 def _reasons(result: SweepResult) -> Integers:
-    """Return why each point has no score, shape (points,): 0 for no such figure, higher the worse it failed."""
+    """Return why each point has no score, shape (points,): 0 for a missing metric, higher for worse failures."""
     reasons = np.zeros(len(result.order), np.int64)
     for number, (flag, _, _) in enumerate(reversed(REASONS), 1):
         reasons[result.columns[flag]] = number
@@ -210,7 +210,7 @@ def _reasons(result: SweepResult) -> Integers:
 
 
 def _label(axis: Any, text: str, log: bool) -> None:
-    """Label an axis; a logarithmic one has its ticks at 1, 2 and 5."""
+    """Label an axis; ticks of a logarithmic one are at 1, 2 and 5."""
     axis.set_label_text(text)
     if log:
         axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
@@ -219,7 +219,7 @@ def _label(axis: Any, text: str, log: bool) -> None:
 
 
 def _edges(swept: SweptObject) -> Floats:
-    """Return the edges of the cells around the values, in the middle between neighbours on the axis's own scale."""
+    """Return the edges of the cells around the values, in the middle between neighbours on the axis' scale."""
     values = swept.values().astype(float)
     on_scale = np.log(values) if swept.spacing == "log" else values
     if len(values) == 1:

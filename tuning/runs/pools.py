@@ -1,9 +1,9 @@
-"""Where work runs: in this process, on processes of this machine, or on a Dask cluster.
+"""Pools that run tasks: this process, other processes of this machine, or a Dask cluster.
 
-A task is a function of a module, called with one item; what it returns must depend on the item alone, so that it
-matters to no result where and in which order tasks ran. Every task outside this process carries the hash of our sources
-and is refused by a worker that has others, whenever that worker came. It carries the content of its user's files as
-well (`inputs.Input`): a worker opens none of its own.
+A task is a function of a module, called with one item; its result must depend on the item alone, so that place and
+order of the tasks do not affect results. Every task outside this process carries the hash of our sources, and a worker
+with other sources refuses it, also one that joined later. It also carries the content of the user's files
+(`inputs.Input`): a worker opens none of its own.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ Result = TypeVar("Result")
 AGAIN = "continue with --resume"
 CONNECT_TIMEOUT = 10.0  # s, for a scheduler to answer
 FIRST_RESULT = "waiting for the first result (a worker that runs for the first time compiles for half a minute)"
-# Files of a tls:// address, and what Dask's security calls them.
+# Files of a tls:// address, and their names in Dask's security.
 TLS_FILES = {"ca": "tls_ca_file", "cert": "tls_client_cert", "key": "tls_client_key"}
-WORKERS_PERIOD = 3.0  # s, between two looks at whether a cluster has workers
+WORKERS_PERIOD = 3.0  # s, between two checks whether a cluster has workers
 
 logger = logging.getLogger(__name__)
 
 
 class PoolError(RuntimeError):
-    """Work could not be done where it was to run: one line with its remedy."""
+    """Work could not be done in a pool: one line with its remedy."""
 
 
 def _silent(_what: str) -> None:
@@ -56,10 +56,10 @@ def _anything(_item: Any, _result: Any) -> bool:
 
 
 class Pool:
-    """Somewhere for work to run."""
+    """A pool that runs tasks one after the other in this process."""
 
-    width = 1  # tasks that run at a time, about
-    shares_disk = True  # whether tasks can go on from files of this machine
+    width = 1  # approximate number of tasks that run at the same time
+    shares_disk = True  # whether tasks can continue from files of this machine
 
     def unordered(
         self,
@@ -68,17 +68,16 @@ class Pool:
         say: Say = _silent,
         fits: Callable[[Item, Result], bool] = _anything,
     ) -> Iterator[tuple[int, Result]]:
-        """Give the number of an item and its result as each is done.
+        """Yield the number of an item and its result when it is done.
 
         Args:
-            function: Of a module.
+            function: Function of a module.
             items: Its arguments.
-            say: Called with what is waited for, "" when the work goes on; from any thread.
-            fits: Whether a result has the form of what is computed of an item; one from elsewhere that has not is
-                refused.
+            say: Called, from any thread, with what the pool waits for; "" when the work continues.
+            fits: Whether a result has the form that belongs to an item; other results from workers are refused.
 
         Raises:
-            PoolError: If a worker is lost, or gives back what is no result of its work; the message names it.
+            PoolError: If a worker is lost, or returns an invalid result; the message names the worker.
         """
         return self._unordered(function, items, say, fits)
 
@@ -87,7 +86,7 @@ class Pool:
             yield k, function(item)
 
     def differences(self) -> list[str]:
-        """Return a line for each way in which the workers are not like this process: last digits may then differ."""
+        """Return a line for each difference of the workers to this process that may change last digits."""
         return []
 
 
@@ -99,15 +98,15 @@ def in_order(pool: Pool, function: Callable[[Item], Result], items: Sequence[Ite
 
 @contextmanager
 def open_pool(workers: int | None = None, cluster: str | None = None, again: str = AGAIN) -> Iterator[Pool]:
-    """Give somewhere for work to run.
+    """Open a pool.
 
     Args:
-        workers: Processes of this machine; None for this process itself.
-        cluster: Address of the scheduler of a running Dask cluster, as `parse_cluster` reads it.
-        again: What to do when work is lost, for messages.
+        workers: Number of processes on this machine; None runs in this process.
+        cluster: Address of the scheduler of a running Dask cluster, in the form of `parse_cluster`.
+        again: The remedy if work is lost, for messages.
 
     Raises:
-        ValueError: For both, fewer than one worker, or a cluster while `distributed` is not installed.
+        ValueError: If both are given, for fewer than one worker, or if `distributed` is not installed for a cluster.
         PoolError: If the cluster cannot be reached.
     """
     if workers is not None and cluster is not None:
@@ -171,7 +170,7 @@ class _Dask(Pool):
         from distributed.scheduler import KilledWorker
 
         packed = [pickle.dumps((function, item)) for item in items]
-        # Not pure: equal items of two runs on one cluster are computed twice rather than taken from its memory.
+        # Not pure: equal items of two runs on one cluster must be computed twice, not taken from its memory.
         futures = {
             self._client.submit(pickle.loads, _call(_checked, provenance.SOURCES, work), pure=False): k
             for k, work in enumerate(packed)
@@ -191,7 +190,7 @@ class _Dask(Pool):
         except ImportError as error:
             raise self._without_package(error) from None
         except AttributeError as error:
-            if "Can't get attribute" not in str(error):  # pickle's, of what its version of our packages does not have
+            if "Can't get attribute" not in str(error):  # pickle's, for a name that its version of our packages lacks
                 raise
             raise self._without_package(error) from None
         except KilledWorker as error:
@@ -209,12 +208,12 @@ class _Dask(Pool):
         )
 
     def _holder(self, future: Any) -> str:
-        """Return which worker has a result, as the scheduler knows it."""
+        """Return the workers that have a result, according to the scheduler."""
         addresses = self._client.who_has([future]).get(future.key, ())
         return f"worker {', '.join(addresses)}" if addresses else "a worker"
 
     def _unlike(self, who: str, found: Mapping[str, Any]) -> list[str]:
-        """Return a line for each version that a worker has otherwise than this process, once."""
+        """Return a line for each version in which a worker differs from this process, each line only once."""
         here = provenance.versions()
         lines = [
             f"{who} has {name} {version}, here it is {here.get(name)}: last digits may differ"
@@ -227,7 +226,7 @@ class _Dask(Pool):
 
     @contextmanager
     def _told_of_no_workers(self, say: Say) -> Iterator[None]:
-        """Report if the last worker goes: the work waits for another one, for ever if need be."""
+        """Report if no worker is left: the run waits for a new one without limit."""
         ended = threading.Event()
 
         def watch() -> None:
@@ -235,7 +234,7 @@ class _Dask(Pool):
             while not ended.wait(WORKERS_PERIOD):
                 try:
                     there = self._client.nthreads()
-                except Exception:  # of a scheduler that is gone, which the futures tell
+                except Exception:  # the scheduler is gone, which the futures report
                     return
                 if not there:
                     say(f"waiting for a worker: `dask worker {self._address}`")
@@ -272,12 +271,12 @@ class _Dask(Pool):
 
 
 def parse_cluster(text: str) -> tuple[str, dict[str, Any]]:
-    """Return the address of a scheduler, and of tls:// the files that `?ca=...&cert=...&key=...` names.
+    """Return the address of a scheduler, and for tls:// the files in `?ca=...&cert=...&key=...`.
 
-    Without them Dask's own configuration counts (distributed.comm.tls).
+    Without these, Dask's own configuration is used (distributed.comm.tls).
 
     Raises:
-        ValueError: For what is no address, or a file that is not there.
+        ValueError: For an invalid address, or a missing file.
     """
     address, _, query = text.partition("?")
     if not re.fullmatch(r"[a-z]+://.+:\d+", address):
@@ -308,7 +307,7 @@ def _cluster(address: str, again: str) -> Iterator[Pool]:
     address, certificates = parse_cluster(address)
     try:
         client = Client(address, security=certificates or None, timeout=CONNECT_TIMEOUT, set_as_default=False)
-    except TypeError:  # Dask's, of tls:// without any
+    except TypeError:  # Dask's error for tls:// without certificates
         files = "&".join(f"{name}=FILE" for name in TLS_FILES)
         raise PoolError(f"--cluster {address} needs certificates: {address}?{files}") from None
     except (OSError, TimeoutError, ValueError) as error:
@@ -326,7 +325,7 @@ def _cluster(address: str, again: str) -> Iterator[Pool]:
 
 @contextmanager
 def _quiet_dask() -> Iterator[None]:
-    """Let Dask log no tracebacks of a connection that is lost: PoolError says it in a line."""
+    """Suppress Dask's tracebacks of a lost connection, which PoolError reports in one line."""
     loggers = [logging.getLogger(name) for name in logging.root.manager.loggerDict if name.startswith("distributed")]
     levels = [each.level for each in loggers]
     for each in loggers:
@@ -339,7 +338,7 @@ def _quiet_dask() -> Iterator[None]:
 
 
 class _Call:
-    """A call that is made where it is unpickled."""
+    """A call that is executed when it is unpickled."""
 
     def __init__(self, *call: Any) -> None:
         self._call = call
@@ -350,16 +349,16 @@ class _Call:
 
 
 def _call(function: Callable[..., Any], *arguments: Any) -> bytes:
-    """Return bytes of which `pickle.loads` makes a call.
+    """Pickle a call so that `pickle.loads` executes it.
 
-    Dask itself unpickles functions of tasks before they run, and a worker without our packages then ends, once and
-    again, with no word to the caller. This one is unpickled within the task, whose failure comes back.
+    Dask itself unpickles functions of tasks before they run, and a worker without our packages then ends repeatedly,
+    without a message to the caller. This one is unpickled within the task, so that its failure is returned.
     """
     return pickle.dumps(_Call(function, *arguments))
 
 
 class _Answer(NamedTuple):
-    """A worker's answer to a task: on which work, with which versions, and the result with its hash."""
+    """A worker's answer to a task: hash of the work, versions, and the result with its hash."""
 
     work: str
     versions: Mapping[str, str]
@@ -368,9 +367,9 @@ class _Answer(NamedTuple):
 
 
 def _checked(sources: str, work: bytes) -> _Answer:
-    """Do a task on a worker, if its sources are those of the process that gives the work.
+    """Run a task on a worker, if its sources are those of the process that gives the work.
 
-    The work is unpickled after that: what other sources do not know cannot be.
+    The work is unpickled after this check: other sources may not know its names.
     """
     try:
         provenance.check_sources(sources)
@@ -385,7 +384,7 @@ def _checked(sources: str, work: bytes) -> _Answer:
 
 
 def _result_of(answer: Any, work: bytes, fits: Callable[[Any], bool], who: str, again: str) -> Any:
-    """Return the result in an answer; PoolError, naming the worker, for an answer that does not belong to this work."""
+    """Return the result in an answer; PoolError, naming the worker, for an answer that does not fit this work."""
     wrong, result = _wrong_with(answer, work), None
     if not wrong:
         result = pickle.loads(answer.content)
@@ -403,7 +402,7 @@ def _result_of(answer: Any, work: bytes, fits: Callable[[Any], bool], who: str, 
 
 
 def _wrong_with(answer: Any, work: bytes) -> str:
-    """Return a description of an answer that does not belong to this work, "" if it does."""
+    """Describe why an answer does not belong to this work; "" if it does."""
     if not isinstance(answer, _Answer):
         return "nothing" if answer is None else f"a value of type {type(answer).__name__}"
     if answer.versions.get("sources") != provenance.SOURCES:
@@ -418,13 +417,13 @@ def _sha256(content: bytes) -> str:
 
 
 def _versions() -> dict[str, str]:
-    """Return the versions of a worker, its sources as they lie there now if they were edited since it began."""
+    """Return the versions of a worker, with the present hash of its sources if they were edited since it started."""
     found, now = provenance.versions(), provenance.hash_of_sources()
     return found if now == found["sources"] else found | {"sources": now}
 
 
 def _as_worker() -> None:
-    """Leave Ctrl-C and warnings to the process that gives the work, and end with it, whatever ends it."""
+    """Leave Ctrl-C and warnings to the parent process, and exit when the parent ends for any reason."""
     warnings.simplefilter("ignore")
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
@@ -435,5 +434,5 @@ def _end_with_parent() -> None:
     if parent is not None:
         parent.join()
         forget_copies()
-        # At once: a thread that waits in a queue that is not filled any more would wait for ever.
+        # Immediate exit: a thread that waits for an abandoned queue would never end.
         os._exit(1)

@@ -1,4 +1,4 @@
-"""Where results go and what made them: run folders that are complete or absent, versions and a hash of the sources."""
+"""Run folders that are complete or absent; versions and a hash of the sources that made the results."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ _OURS = tuple(ROOT / name for name in ("drive_env", "mechanics", "tuning", "agen
 
 
 def hash_of_sources(folders: Iterable[Path] = _OURS) -> str:
-    """Return a hash of the names and contents of all files of our packages, data files included."""
+    """Return a hash of the names and contents of all files of our packages, with data files."""
     digest = hashlib.sha256()
     for folder in folders:
         for path in sorted(folder.rglob("*")):
             parts = path.relative_to(folder.parent).parts
-            # What Python or an editor leaves there decides nothing.
+            # Files of Python or an editor do not matter.
             if path.suffix == ".pyc" or any(part.startswith(".") for part in parts) or not path.is_file():
                 continue
             content = path.read_bytes()
@@ -37,7 +37,7 @@ def hash_of_sources(folders: Iterable[Path] = _OURS) -> str:
     return digest.hexdigest()[:16]
 
 
-# As this process was loaded: a file that is edited later changes what it reads, but not what it runs.
+# As loaded by this process: later edits of files do not change what it runs.
 SOURCES = hash_of_sources()
 
 
@@ -45,9 +45,9 @@ def check_begun(what: object, recorded: object, remedy: str) -> None:
     """Raise ValueError, with both hashes, if a run to be continued was begun with other sources.
 
     Args:
-        what: The file or folder that keeps it.
+        what: The file or folder of the run.
         recorded: The hash in it, if any.
-        remedy: What else its user can do.
+        remedy: An alternative for the user.
     """
     if recorded != SOURCES:
         raise ValueError(
@@ -57,16 +57,16 @@ def check_begun(what: object, recorded: object, remedy: str) -> None:
 
 
 def check_study(study: Any, file: Path, remedy: str, subject: str = "") -> None:
-    """Have an Optuna study carry the hash of the sources and its subject; check those of one that has trials already.
+    """Store the hash of the sources and the subject in a new Optuna study; check those of one with trials.
 
     Args:
         study: The study.
         file: Its journal.
-        remedy: What else its user can do.
-        subject: What its trials are of, as lines of text: trials of something else are not comparable.
+        remedy: An alternative for the user.
+        subject: What its trials are of, as lines of text: trials of another subject are not comparable.
 
     Raises:
-        ValueError: If it was begun with other sources or on another subject, with the first line that differs.
+        ValueError: If it was begun with other sources or another subject, with the first line that differs.
     """
     if not study.trials:
         study.set_user_attr("sources", SOURCES)
@@ -82,7 +82,7 @@ def check_study(study: Any, file: Path, remedy: str, subject: str = "") -> None:
 
 
 def check_sources(expected: str) -> None:
-    """Raise ValueError, with both hashes, if this process was loaded from other sources, or its files are others now.
+    """Raise ValueError, with both hashes, if this process was loaded from other sources, or its files have changed.
 
     Args:
         expected: The hash of the process that gives the work.
@@ -96,7 +96,7 @@ def check_sources(expected: str) -> None:
 
 
 def versions() -> dict[str, str]:
-    """Return the versions that decide the digits: packages, our sources, Python, the processor of compiled kernels."""
+    """Return the versions on which results depend: packages, our sources, Python, the processor of compiled kernels."""
     import llvmlite.binding
 
     found = {"drive-env": __version__} | {name: importlib.metadata.version(name) for name in _PACKAGES}
@@ -105,7 +105,7 @@ def versions() -> dict[str, str]:
 
 
 def differences(recorded: Mapping[str, str]) -> list[str]:
-    """Return a line for each version that is not the recorded one: the last digits may then differ."""
+    """Return a line for each version that differs from the recorded one: last digits may then differ."""
     if not recorded:
         return []
     here = versions()
@@ -117,7 +117,7 @@ def differences(recorded: Mapping[str, str]) -> list[str]:
 
 
 def run_folder(kind: str, parent: str | Path = "runs") -> Path:
-    """Return a folder name that does not exist yet: runs/<date>-<time>-<kind>."""
+    """Return the name of a new folder: runs/<date>-<time>-<kind>."""
     stem = f"{time.strftime('%Y%m%d-%H%M%S')}-{kind}"
     name, k = Path(parent) / stem, 2
     while name.exists():
@@ -126,7 +126,7 @@ def run_folder(kind: str, parent: str | Path = "runs") -> Path:
 
 
 def nearest_place(path: Path) -> tuple[Path, bool]:
-    """Return the nearest thing above a new file or folder that exists, and whether one may write there."""
+    """Return the nearest existing parent of a new file or folder, and whether it is writable."""
     place = path.absolute().parent
     while not place.exists():
         place = place.parent
@@ -134,12 +134,12 @@ def nearest_place(path: Path) -> tuple[Path, bool]:
 
 
 def check_folder(folder: str | Path) -> None:
-    """Raise OSError unless results can be written into the folder: new or empty, and its place writable.
+    """Raise OSError unless the folder is new or empty, and its parent writable.
 
     Raises:
-        FileExistsError: If something is there already.
-        PermissionError: If the place cannot be written.
-        NotADirectoryError: If a file stands in the way.
+        FileExistsError: If the folder is not empty, or a file has its name.
+        PermissionError: If the parent is not writable.
+        NotADirectoryError: If the parent is a file.
     """
     path = Path(folder)
     if path.is_dir():
@@ -156,7 +156,7 @@ def check_folder(folder: str | Path) -> None:
 
 @contextmanager
 def new_folder(folder: str | Path) -> Iterator[Path]:
-    """Give a partial folder to write into; it takes its name once all is written, and vanishes if anything fails."""
+    """Yield a partial folder to write into; it gets its name when all is written, and is removed if anything fails."""
     path = Path(folder)
     check_folder(path)
     partial = path.absolute().with_name(f".{path.absolute().name}.{os.getpid()}.partial")
@@ -167,12 +167,12 @@ def new_folder(folder: str | Path) -> Iterator[Path]:
     try:
         yield partial
         if path.is_dir():
-            path.rmdir()  # empty; a rename onto a folder fails on Windows
+            path.rmdir()  # it is empty; renaming onto a folder fails on Windows
         partial.rename(path)
         keep_names(path.absolute().parent)
     except BaseException as error:
         shutil.rmtree(partial, ignore_errors=True)
-        if isinstance(error, OSError) and error.errno is not None:  # it names the partial folder, or nothing
+        if isinstance(error, OSError) and error.errno is not None:  # its file name is the partial folder's, or missing
             named = None if error.filename is None else Path(error.filename)
             name = path if named is None else path / named.name if named.is_relative_to(partial) else named
             raise OSError(error.errno, error.strerror, str(name)) from None

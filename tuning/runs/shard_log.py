@@ -1,7 +1,7 @@
-"""Results of shards in a file that is only ever appended to: a killed run leaves it, and goes on from it.
+"""Results of shards in a file that is only appended to: an interrupted run leaves it and continues from it.
 
-A frame is a line of JSON, which shard it is, how long its data are and their hash, and the data: NumPy arrays. Frames
-are complete or recognised as incomplete; what was being written when the process was killed is cut off.
+A frame is a line of JSON with the shard's number, the length of the data and their hash, followed by the data: NumPy
+arrays. Incomplete frames are detected and cut off, such as one that was being written when the process was killed.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ LONGEST_HEADER = 1000  # bytes
 
 
 class ShardLogError(ValueError):
-    """A file that is not of this run: one line with its remedy."""
+    """A file that does not belong to this run: one line with its remedy."""
 
 
 class ShardLog:
     """The results of a run's shards so far.
 
     Args:
-        path: The file; made if it is not there.
-        key: What the results belong to: a text that another run does not have.
+        path: The file; created if it does not exist.
+        key: Text that identifies the run of the results.
 
     Raises:
         ShardLogError: If the file belongs to another run, or was begun with other sources.
@@ -48,7 +48,7 @@ class ShardLog:
         self.path, self.key = Path(path), key
         self._key = hashlib.sha256(f"{FORMAT} {key}".encode()).hexdigest()
         self.done: dict[int, Arrays] = {}
-        self.holds_results = False  # from before the first frame is written: an interrupt may come at any moment
+        self.holds_results = False  # set before the first frame is written: an interrupt may come at any time
         end = self._read() if self.path.exists() else 0
         self._file: BinaryIO = self.path.open("r+b" if end else "wb")
         self._file.truncate(end)
@@ -57,13 +57,13 @@ class ShardLog:
             try:
                 self._write(json.dumps({"run": self._key, "sources": provenance.SOURCES}).encode() + b"\n")
             except OSError:
-                with suppress(OSError):  # what found no room is tried once more
+                with suppress(OSError):  # closing tries again to write what did not fit on the disk
                     self._file.close()
                 self.path.unlink()
                 raise
 
     def append(self, shard: int, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Add the result of a shard; once this returns it survives the process."""
+        """Add the result of a shard; after this call it survives the process."""
         data = io.BytesIO()
         np.savez(data, **arrays)  # type: ignore[arg-type]  # NumPy's own stub takes a keyword for its flag
         content = data.getvalue()
@@ -73,8 +73,8 @@ class ShardLog:
         self.done[shard] = dict(arrays)
 
     def close(self) -> None:
-        """Close the file; it stays."""
-        with suppress(OSError):  # what found no room is tried once more, and was told
+        """Close the file; it is not deleted."""
+        with suppress(OSError):  # closing tries again to write what did not fit; this was already reported
             self._file.close()
 
     def __enter__(self) -> ShardLog:
@@ -122,7 +122,7 @@ class ShardLog:
 
 
 def _header(file: BinaryIO) -> dict[str, Any] | None:
-    """Return the next line as JSON, or None if there is no complete one."""
+    """Return the next line as JSON; None if it is incomplete or not JSON."""
     line = file.readline(LONGEST_HEADER)
     if not line.endswith(b"\n"):
         return None

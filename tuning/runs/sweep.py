@@ -1,4 +1,4 @@
-"""The sweep: every point of a grid of gains on machines of its own, for each point the same ones, in parallel."""
+"""The sweep: every point of a grid of gains on its own machines, equal for all points, in parallel."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ from tuning.runs.shard_log import Arrays, ShardLog
 
 FLAGS = ("diverged", "oscillates", "fault")
 PIECE = 0.02  # s of simulation between two reports of progress
-CLOSING_TIME = 0.6  # s, in which the encoder of a standing rotor is aligned
-MAX_SAMPLES = 4_000_000  # of one signal held at a time: 32 MB
-MAX_MACHINES = 1024  # of a shard: small enough for little to be lost when a run is killed
-SHARDS_PER_WORKER = 4  # at least, where there are points enough: for the last to end soon after the first
+CLOSING_TIME = 0.6  # s, in which the encoder of a rotor at rest is aligned
+MAX_SAMPLES = 4_000_000  # of one signal in memory at a time: 32 MB
+MAX_MACHINES = 1024  # of a shard: small, so that little is lost when a run is killed
+SHARDS_PER_WORKER = 4  # at least, if there are enough points: so that all workers finish at about the same time
 
 Progress = Callable[[str, float], None]
 
@@ -52,12 +52,12 @@ class SweepResult:
     Attributes:
         experiment: The experiment.
         objects: Labels of the swept objects, e.g. `2042h:01`.
-        names: The same with their names.
-        columns: Every column of the table by name, each of shape (points,), in the order of the grid.
-        order: The points from best to worst.
+        names: Labels of the swept objects with their names.
+        columns: All columns of the table by name, each of shape (points,), in the order of the grid.
+        order: Indices of the points from best to worst.
         response: The recording of the best point.
-        simulated: Simulated time of all machines together, without what was resumed [s].
-        wall: Wall time of that [s].
+        simulated: Simulated time of all machines together, without resumed parts [s].
+        wall: Wall time of the simulation [s].
     """
 
     experiment: Experiment
@@ -71,7 +71,7 @@ class SweepResult:
 
     @property
     def score_column(self) -> str:
-        """Name of the column that ranks; inf where a point oscillates, tripped, diverged or has no such figure."""
+        """Name of the ranking's column; it is inf if a point oscillates, tripped, diverged or lacks the metric."""
         return f"score [{metrics.unit_of(self.experiment.metric.name)}]"
 
     @property
@@ -84,7 +84,7 @@ class SweepResult:
         return [{name: column[k].item() for name, column in self.columns.items()} for k in self.order[:count]]
 
     def without_effect(self) -> list[str]:
-        """Return the swept objects that change nothing at all in this excitation."""
+        """Return the swept objects that have no effect at all in this excitation."""
         shape = self.experiment.shape()
         names = [name for name in self.columns if name not in self.objects and name != "rank"]
         found = []
@@ -97,11 +97,11 @@ class SweepResult:
 
 
 class Shard(NamedTuple):
-    """A part of a grid: a sweep is split into these, whatever it runs on."""
+    """A part of a grid; a sweep is split into these on any kind of pool."""
 
     experiment: Experiment
-    first: int  # its points, of those of the grid
-    last: int  # the first that is not its own
+    first: int  # its first point in the grid
+    last: int  # the point after its last
     num_threads: int | None
 
 
@@ -112,20 +112,21 @@ def shards(
     width: int = 1,
     done: Mapping[int, int] = MappingProxyType({}),
 ) -> list[Shard]:
-    """Return the parts of a grid that are still to do; how it is cut changes no digit.
+    """Return the remaining parts of a grid; how it is split does not affect results.
 
     Args:
         experiment: The experiment.
-        num_threads: Threads that simulate each.
-        width: How many can be worked on at a time: for many, parts are smaller.
-        done: First point of each part that is done -> the point after its last.
+        num_threads: Threads that simulate each part.
+        width: Number of parts that can run at the same time: for many, parts are smaller.
+        done: First point of each finished part -> the point after its last.
     """
     samples = round(experiment.excitation.duration / experiment.excitation.sampling_period)
     axes = find_load(experiment.load).num_axes * experiment.machines
     points = experiment.size()
     fair = points // (width * SHARDS_PER_WORKER) if width > 1 else MAX_MACHINES
     fit = min(MAX_SAMPLES // (samples * axes), fair, MAX_MACHINES // experiment.machines)
-    # Whole packed models, from the same points in every cut: a constraint solver works on all copies of one at once.
+    # Whole packed models, with the same points in every split: a constraint solver computes all copies of a model
+    # together.
     size = int(np.clip(fit, COPIES_PER_MODEL, MAX_MACHINES)) // COPIES_PER_MODEL * COPIES_PER_MODEL
     parts, first = [], 0
     while first < points:
@@ -150,15 +151,15 @@ def run(
 
     Args:
         experiment: The experiment.
-        progress: Called with what is being done and its share done so far.
-        num_threads: Threads that simulate, in this process; the number of cores by default. It changes no digit.
-        pool: Where shards run; in this process by default. It changes no digit either.
-        log: Shards that are done already, and where those to come are kept.
+        progress: Called with the present action and the share that is done.
+        num_threads: Threads that simulate in this process; the number of cores by default. They do not affect results.
+        pool: Pool that runs the shards; None runs them in this process. It does not affect results.
+        log: Finished shards of an earlier run, to which new ones are added.
 
     Raises:
-        ExperimentError: If the experiment cannot be.
-        InputError: If a file of its user cannot be taken.
-        PoolError: If shards could not be run where they were to.
+        ExperimentError: If the experiment is invalid.
+        InputError: If a file of the user cannot be read.
+        PoolError: If shards could not run in the pool.
     """
     report = progress or (lambda _what, _share: None)
     resolved = resolve(experiment)
@@ -169,7 +170,7 @@ def run(
     left = shards(experiment, threads, width=width, done=done)
     report("compiling", 0.0)
     if left:
-        # Of workers as well: they find the kernels compiled, and warnings come once and here.
+        # Also for workers: they then find compiled kernels, and warnings are shown once, here.
         _compile(experiment)
     started = time.perf_counter()
     with warnings.catch_warnings():
@@ -187,7 +188,7 @@ def run(
 
 
 def _done(left: list[Shard], points: int, pool: Pool | None, report: Progress) -> Iterator[tuple[Shard, Arrays]]:
-    """Give each shard and its result as it is done."""
+    """Yield each shard with its result when it is done."""
     shares = [0.0] * len(left)
     sizes = [part.last - part.first for part in left]
 
@@ -203,7 +204,7 @@ def _done(left: list[Shard], points: int, pool: Pool | None, report: Progress) -
             say(k, 1.0)
             yield left[k], arrays
         return
-    # Two at a time: what builds and judges machines holds the interpreter's lock, what simulates does not.
+    # Two at a time: building and judging machines holds the interpreter's lock, simulating does not.
     with ThreadPoolExecutor(2) as executor:
         futures = {executor.submit(simulate, part, partial(say, k)): part for k, part in enumerate(left)}
         try:
@@ -215,7 +216,7 @@ def _done(left: list[Shard], points: int, pool: Pool | None, report: Progress) -
 
 
 def simulate(shard: Shard, report: Callable[[float], None] = lambda _share: None) -> Arrays:
-    """Return the columns of a shard, and under `best.` the recording of its best point."""
+    """Simulate a shard; return its columns, and under `best.` the recording of its best point."""
     experiment = shard.experiment
     points = experiment.points(shard.first, shard.last)
     with _machines(experiment, len(points), shard.num_threads) as drives:
@@ -224,7 +225,7 @@ def simulate(shard: Shard, report: Callable[[float], None] = lambda _share: None
         columns = _evaluate(experiment, recording) | {"fault": fault}
         diverged = np.repeat(drives.machine.diverged, drives.load.num_axes)
         columns["diverged"] = np.asarray(columns["diverged"] | diverged)
-    # All axes of all machines of a point have its gains; it is as good as its worst axis.
+    # All axes of all machines of a point have its gains; the worst axis counts.
     worst = np.argmax(_score(columns).reshape(-1, axes), axis=1) + np.arange(len(points)) * axes
     columns = {name: values[worst] for name, values in columns.items()}
     best = recording.point(int(worst[np.argmin(_score(columns))]))
@@ -255,7 +256,7 @@ def _column_names(resolved: Resolved) -> list[str]:
 
 
 def _best(found: list[Arrays], experiment: Experiment) -> MoveRecording:
-    """Return the recording of the best point; of equals that of the first shard."""
+    """Return the recording of the best point; of equal ones that of the first shard."""
     shard = found[int(np.argmin([_score(arrays).min() for arrays in found]))]
     recorded = {name: shard[f"best.{name}"] for name in _recorded(experiment)}
     excitation = experiment.excitation
@@ -263,14 +264,14 @@ def _best(found: list[Arrays], experiment: Experiment) -> MoveRecording:
 
 
 def _compile(experiment: Experiment) -> None:
-    """Compile the kernels, or load them, here and now: from a thread, Ctrl-C would have to wait for the compiler."""
+    """Compile or load the kernels in this thread: in another one, Ctrl-C would have to wait for the compiler."""
     with _machines(experiment, 1, 1) as drives:
         motion.enable(drives, mode="pv")
         drives.record(_signals(resolve(experiment)), 0.001)
 
 
 def _signals(resolved: Resolved) -> list[ObjectName]:
-    """Return the objects to record: velocity and current, or those of an open loop without a measured current."""
+    """Return the objects to record, by the kind of loop and the signals that it measures."""
     if resolved.loop is not None:
         return [cia402.POSITION_DEMAND, cia402.POSITION_ACTUAL, cia402.TORQUE_ACTUAL]
     if resolved.device.gains.is_open_loop:
@@ -298,12 +299,12 @@ def _record(
     points: Integers,
     report: Callable[[float], None],
 ) -> tuple[MoveRecording, Mask]:
-    """Return the recording of every point, and which ended in fault."""
+    """Return the recording of every point, and which points ended in fault."""
     excitation, is_open_loop = experiment.excitation, resolved.device.gains.is_open_loop
     unclosed = np.zeros(drives.num_axes, bool)
     if is_open_loop:
         drives.write(cia402.SENSOR_SELECTION, ENCODER)
-    # Enabled with the preset's gains, which are stable, so that the point's gains meet every axis in the same state.
+    # Enabled with the preset's gains, which are stable, so that all points' gains start from the same state.
     motion.enable(drives, mode="pv")
     if resolved.loop is not None:
         unclosed = _close_loop(drives, resolved.loop)
@@ -342,8 +343,8 @@ def _record(
     )
     tripped = unclosed | cia402.matches(drives.read(cia402.STATUSWORD), cia402.FAULT_BIT)
     for message in drives.emergencies():
-        tripped[message.axis] = True  # a limit of travel too: what follows it says nothing of the gains
-    # The field runs ahead of a rotor that has lost steps; a PID alone is behind its demand in any case.
+        tripped[message.axis] = True  # also by a limit of travel: what follows says nothing about the gains
+    # The field leads a rotor that has lost steps; only with a PID is the demand always behind.
     on_ramp = resolved.loop is not None and resolved.loop.kind == PID_ON_RAMP
     if recording.lag is not None and (recording.is_open_loop or on_ramp):
         tripped |= (np.abs(recording.lag) > LOST).any(axis=0)
@@ -351,9 +352,9 @@ def _record(
 
 
 def _close_loop(drives: EmulatedDrives, loop: ClosedLoop) -> Mask:
-    """Close the loops of enabled axes with the first gains, or the preset's; return of which axes they stay open.
+    """Close the loops of enabled axes with the first gains, or the preset's; return axes whose loops stay open.
 
-    The following error window is off: an axis that is overloaded falls behind, and shows by what it catches up with.
+    The following error window is off: an overloaded axis falls behind, and catches up by its gains.
     """
     known = drives.device.gains
     for name, value in loop.first.items():
@@ -367,11 +368,11 @@ def _close_loop(drives: EmulatedDrives, loop: ClosedLoop) -> Mask:
 def _stepper_signals(
     drives: EmulatedDrives, traces: list[Trace], period: float, loop: ClosedLoop | None
 ) -> dict[str, Floats]:
-    """Return speed by the encoder, lag and effort of the points, and nan for a current that nothing measures.
+    """Return speed by the encoder, lag and effort of the points, and nan for a current that is not measured.
 
-    Where the encoder commutates the torque current is measured, and its limit is the run current.
+    If the encoder commutates, the torque current is measured, and its limit is the run current.
 
-    606Ch of these drives is the speed of the steps, whatever the rotor does.
+    606Ch of these drives is the speed of the steps, not of the rotor.
     """
     demand, actual = (
         np.concatenate([trace[name] for trace in traces]) for name in (cia402.POSITION_DEMAND, cia402.POSITION_ACTUAL)
@@ -399,7 +400,7 @@ def _stepper_signals(
 
 
 def _pieces(step: float, load: float, end: float, piece: float, period: float) -> list[tuple[float, float]]:
-    """Return the pieces [s] in which a run is recorded: of whole sampling periods, cut at the two events."""
+    """Return the pieces [s] in which a run is recorded: whole sampling periods, split at the two events."""
     edges = [0.0, step, load, end]
     size = max(1, round(piece / period)) * period
     pieces = []
@@ -413,7 +414,7 @@ def _pieces(step: float, load: float, end: float, piece: float, period: float) -
 
 
 def _evaluate(experiment: Experiment, recording: MoveRecording) -> dict[str, NDArray[Any]]:
-    """Return the score before the flags count, every metric, and the flags but the fault's."""
+    """Return the score without regard to flags, all metrics, and the flags except the fault."""
     found = metrics.figures(recording)
     choice = experiment.metric
     columns: dict[str, NDArray[Any]] = {"score": metrics.score(choice.name, choice.weights, found)}
@@ -426,7 +427,7 @@ def _evaluate(experiment: Experiment, recording: MoveRecording) -> dict[str, NDA
 
 
 def _score(columns: dict[str, NDArray[Any]]) -> Floats:
-    """Return the key of the ranking: inf for a point with a flag, or without the figure."""
+    """Return the key of the ranking: inf for a point with a flag, or without the metric."""
     flagged = np.any([columns[flag] for flag in FLAGS], axis=0) | np.isnan(columns["score"])
     return np.where(flagged, np.inf, columns["score"])
 

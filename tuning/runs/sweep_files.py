@@ -1,4 +1,4 @@
-"""The files of a sweep: its table, its pictures, its settings and inputs."""
+"""The files of a sweep: its table, pictures, settings and inputs."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from tuning.runs import plots, provenance
 from tuning.runs.inputs import write_inputs
 from tuning.runs.sweep import SweepResult
 
-ROWS = 65_536  # of results.csv, that are written at a time
+ROWS = 65_536  # of results.csv that are written at a time
 
 
 def save_sweep(result: SweepResult, folder: str | Path) -> Path:
     """Write results.csv, heatmap.png, best_response.png, settings.toml and inputs/ into a new folder and return it.
 
-    The files are complete or absent: they are written beside the folder and moved.
+    The files are complete or absent: they are written to a partial folder, which is then renamed.
 
     Raises:
-        FileExistsError: If the folder holds something already.
+        FileExistsError: If the folder is not empty.
         OSError: If it cannot be written.
     """
     with provenance.new_folder(folder) as partial:
@@ -33,11 +33,11 @@ def save_sweep(result: SweepResult, folder: str | Path) -> Path:
 
 
 def _write_csv(result: SweepResult, path: Path) -> None:
-    # Python's floats are written with as many digits as tell them apart: nothing is lost, and inf and nan say so.
+    # Python writes floats with all significant digits, and also inf and nan: nothing is lost.
     columns = [column.astype(int) if column.dtype == bool else column for column in result.columns.values()]
     rows = (
         row
-        for first in range(0, len(result.order), ROWS)  # as Python's numbers, a table of a million rows has 600 MB
+        for first in range(0, len(result.order), ROWS)  # a million rows as Python's numbers take 600 MB
         for row in zip(*(column[first : first + ROWS].tolist() for column in columns), strict=True)
     )
     write_table(path, chain([list(result.columns)], rows), lineterminator="\n")

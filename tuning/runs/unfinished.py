@@ -1,8 +1,8 @@
-"""A run that is under way: a folder beside the one that its results will have, from which it goes on if it is killed.
+"""An unfinished run: a folder beside that of the results, from which the run continues if it is interrupted.
 
-The folder of the results is complete or absent. Beside it, named `<folder>.unfinished`, lie the settings of the run,
-its inputs, the results of the shards that are done, and of shards that can go on from where they were what they have so
-far; it vanishes with the last step of the run.
+The folder of the results is complete or absent. The folder beside it, `<folder>.unfinished`, has the run's settings,
+its inputs, the results of finished shards, and partial results of shards that can continue from these; it is removed at
+the end of the run.
 """
 
 from __future__ import annotations
@@ -22,31 +22,31 @@ SUFFIX, SETTINGS, SHARDS, PART = ".unfinished", "settings.toml", "shards", "part
 
 
 def unfinished_folder(folder: str | Path) -> Path:
-    """Return where a run keeps finished shards while its folder is absent."""
+    """Return the folder of an unfinished run, by the folder of its results."""
     path = Path(folder)
     return path.with_name(path.name + SUFFIX)
 
 
 def settings_of(folder: str | Path) -> Path | None:
-    """Return the settings of an unfinished run, None without an unfinished run."""
+    """Return the settings of an unfinished run; None without one."""
     path = unfinished_folder(folder) / SETTINGS
     return path if path.is_file() else None
 
 
 @contextmanager
 def shard_log(folder: str | Path, settings: str, *, resume: bool, inputs: Iterable[Input] = ()) -> Iterator[ShardLog]:
-    """Give the shards of a run that are done, and keep those to come; leave no folder behind without any shard.
+    """Yield the log of a run's shards; if it has no results at the end, remove the folder of the unfinished run.
 
     Args:
-        folder: Where the results will be.
-        settings: What the run repeats from: with other settings it is another run.
-        resume: Go on with an unfinished run if there is one.
-        inputs: What the run has taken from its user's files; the settings have their hashes in a table `inputs`.
+        folder: Folder of the results.
+        settings: Settings from which the run repeats: other settings mean another run.
+        resume: Continue an unfinished run if there is one.
+        inputs: The user's files of the run; a table `inputs` in the settings has their hashes.
 
     Raises:
-        ShardLogError: If an unfinished run is there and is not to be resumed, or is another one.
-        InputError: If one of its inputs was changed since.
-        OSError: If it cannot be written.
+        ShardLogError: If an unfinished run exists and must not be resumed, or is another one.
+        InputError: If one of its inputs has changed.
+        OSError: If the folder cannot be written.
     """
     place = unfinished_folder(folder)
     if place.exists() and not resume:
@@ -74,7 +74,7 @@ def shard_log(folder: str | Path, settings: str, *, resume: bool, inputs: Iterab
 
 @contextmanager
 def telling_what_is_kept(folder: str | Path) -> Iterator[None]:
-    """Have the error of a file that cannot be written, as on a full disk, say how a run in this folder goes on."""
+    """Add to the error of a failed write, as on a full disk, how the run in this folder can continue."""
     try:
         yield
     except OSError as error:
@@ -85,7 +85,7 @@ def telling_what_is_kept(folder: str | Path) -> Iterator[None]:
 
 
 def _recorded(settings: Path) -> object:
-    """Return the inputs in the settings of an unfinished run, None if the file cannot be read."""
+    """Return the inputs in the settings of an unfinished run; None if the file cannot be read."""
     try:
         return read_toml(settings).get("inputs")
     except (OSError, ValueError, tomllib.TOMLDecodeError):
@@ -93,18 +93,18 @@ def _recorded(settings: Path) -> object:
 
 
 def has_parts(log: ShardLog) -> bool:
-    """Return whether shards of a run have begun, and kept partial results."""
+    """Return whether some shards of a run have stored partial results."""
     return any(log.path.parent.glob(f"{PART}*"))
 
 
 def part_path(log: ShardLog, shard: int) -> Path:
-    """Return the file in which a shard of a run keeps partial results."""
+    """Return the file for partial results of a shard."""
     return log.path.with_name(f"{PART}{shard}")
 
 
 @contextmanager
 def part_log(path: Path, key: str) -> Iterator[ShardLog]:
-    """Give the partial results of a shard, and keep those to come; leave no file behind without results."""
+    """Yield the log of a shard's partial results; remove the file if it has no results at the end."""
     with ShardLog(path, key) as log:
         try:
             yield log

@@ -1,1 +1,1 @@
-"""Optimisers of gains."""
+"""Search of gains by optimisers."""

@@ -1,4 +1,4 @@
-"""Margins by model in a search: models of identified axes, by which gains are judged before a drive has them."""
+"""Margins by model in a search: models of identified axes judge gains before a drive gets them."""
 
 from __future__ import annotations
 
@@ -22,19 +22,18 @@ if TYPE_CHECKING:
 
 
 class ModelMargins:
-    """The loops of machines, by the models of their axes.
+    """The models of the machines' loops.
 
     Args:
-        target: Its drives; they are identified here, which takes about four seconds of drive time for each axis of a
-            machine.
-        dynamics: What the loops must keep.
-        where: Axes of whole machines, (num_axes,); the others are not known.
+        target: The target; its drives are identified here, which takes about 4 s of drive time per axis of a machine.
+        dynamics: Requirements on the loops.
+        where: Axes of whole machines to identify, shape (num_axes,).
 
     Attributes:
-        before: Raw gains that the drives had, (num_axes, count).
+        before: Raw gains that the drives had, shape (num_axes, count).
 
     Raises:
-        RuntimeError: If an axis cannot be identified, or is not wired as it should be.
+        RuntimeError: If an axis cannot be identified, or its wiring is wrong.
     """
 
     def __init__(self, target: Target, dynamics: Dynamics, where: Mask) -> None:
@@ -52,23 +51,23 @@ class ModelMargins:
         self._models = loop_models(target, identified, None, where, dynamics)
 
     def slack(self, gains: Integers, axes: slice) -> float:
-        """Return how far a machine keeps the dynamics, relative: 0 where a constraint is just kept.
+        """Return the slack of a machine to the dynamics, relative: 0 if a constraint is only just kept.
 
         Args:
-            gains: Raw, of its axes, (axes_per_machine, count).
-            axes: Which they are.
+            gains: Raw gains of its axes, shape (axes_per_machine, count).
+            axes: Indices of these axes.
         """
         return min(float(model.slack(self.dynamics, gains[None, own - axes.start])[0])
                    for model, own in self._models if axes.start <= own[0] < axes.stop)  # fmt: skip
 
     def margins(self, gains: Integers) -> Floats:
-        """Return phase margin [degrees], gain margin [dB] and Ms of the velocity and of the position loop.
+        """Return phase margin [degrees], gain margin [dB] and Ms of velocity and position loop.
 
         Args:
-            gains: Raw, (num_axes, count).
+            gains: Raw gains, shape (num_axes, count).
 
         Returns:
-            Shape (num_axes, 2, 3); nan for an axis that is not known.
+            Shape (num_axes, 2, 3); nan for an axis that was not identified.
         """
         found = np.full((len(gains), 2, 3), np.nan)
         for model, own in self._models:

@@ -1,11 +1,12 @@
-"""Optimisation of gains on drives: a generation of trials at a time, costed from the drives' signals.
+"""Optimisation of gains on drives: generations of trials, whose cost is computed from the drives' signals.
 
-Optimisers search the logarithms of gains around the baseline rule's, each machine separately or, where the emulated
-machines are copies of one machine, in one search whose generation they try at the same time. The safe search starts at
-gains that are slow and proved, goes on from what has been proved in small steps, and never beyond what oscillated.
+Optimisers search the logarithms of gains around the baseline rule's: each machine separately, or, if the emulated
+machines are copies of one machine, in one search that tries a generation on all copies at the same time. The safe
+search starts at slow gains that proved stable, continues in small steps from proved ones, and never beyond gains that
+oscillated.
 
-Where dynamics are asked for, the axes are identified first, and a drive gets no gains that break them by the model of
-its axes: the sampler gets their robust cost (drive_env/trials/score.py) by how far they are from keeping them.
+With dynamics, the axes are identified first, and no drive gets gains that break the dynamics by the model of its axes:
+for these the sampler gets the robust cost (drive_env/trials/score.py), which depends on how far they break them.
 """
 
 from __future__ import annotations
@@ -35,33 +36,33 @@ from tuning.search.trial_log import LoggedTrials
 from tuning.target import Target, timed
 
 COST = "cost"
-WIDTH = math.log(6.0)  # the search reaches from a sixth to six times the rule's gains
-SAFE_STEP = 0.4  # of a gain's logarithm, from the nearest gains that were proved
-SAFE_STARTS = 3  # times that the safe gains are halved before the search gives up
-SAFE_HALVINGS = 3  # of a step that would lead to what oscillated, before it is not taken at all
-PULLED = 0.2  # what a point costs per unit of the way that the safe search held it back
-SHUNNED = 1.0  # and what a stopped trial costs the safe search besides
-UNTRIED = 20  # proposals for each trial that may break the dynamics before the search ends
-SLOWER = 6  # times that gains to start from are halved until they keep the dynamics
+WIDTH = math.log(6.0)  # from a sixth to six times the rule's gains
+SAFE_STEP = 0.4  # of a gain's logarithm, measured from the nearest proved gains
+SAFE_STARTS = 3  # halvings of the safe gains before the search of a machine ends
+SAFE_HALVINGS = 3  # halvings of a step towards gains that oscillated, before it is skipped
+PULLED = 0.2  # cost of a point per unit of distance by which the safe search moved it
+SHUNNED = 1.0  # additional cost of a stopped trial in the safe search
+UNTRIED = 20  # proposals that may break the dynamics per trial, before the search ends
+SLOWER = 6  # halvings of first gains until they keep the dynamics
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How gains are searched.
+    """The settings of a search.
 
     Attributes:
         sampler: One of `samplers.SAMPLERS`.
-        trials: Of every search, the first ones included.
+        trials: Number of trials of every search, with the first ones.
         objectives: ("cost",), or several of "speed", "robustness" and "current" (trial_bench.py).
-        gains: Names of those that are searched, of the device's; the others are the rule's. None is those of the
-            velocity and the position loop.
-        width: How far the search reaches, as the logarithm of a factor of the rule's gains.
-        safe: Start from safe gains and go on from what was proved.
-        seed: Of everything random.
-        journal: File of Optuna's journal, in which the search is kept and from which it goes on.
-        subject: What is searched, as text: a journal of something else is refused.
-        dynamics: What the outer loops must keep by their model, as `find_dynamics` takes it; None asks for nothing.
-        inertia_range: Least and greatest load inertia that they must bear, likewise.
+        gains: Names of the searched gains of the device; the others are set by the rule. None selects those of velocity
+            and position loop.
+        width: Half width of the search, as the logarithm of a factor on the rule's gains.
+        safe: Start from safe gains and continue from proved ones.
+        seed: Seed of everything random.
+        journal: File of Optuna's journal, in which the search is stored and from which it continues.
+        subject: What is searched, as text: a journal with another subject is refused.
+        dynamics: Requirements on the outer loops by their model, as in `find_dynamics`; None sets none.
+        inertia_range: Range of load inertia over which they must be kept, as in `find_dynamics`.
     """
 
     sampler: str = "tpe"
@@ -88,17 +89,17 @@ class Settings:
 
 
 class TrialRow(NamedTuple):
-    """A trial that was made.
+    """A finished trial.
 
-    search, number: Which search, and the trial's number in it.
-    gains: Of the machine's axes, raw integers, (axes_per_machine, count).
+    search, number: Index of the search, and number of the trial in it.
+    gains: Gains of the machine's axes, raw integers, shape (axes_per_machine, count).
     cost: ln J by measured terms.
-    objectives: In the order of `OBJECTIVES`.
-    aborted: Stopped, since it oscillated or went into fault. fragile: Not kept, since with these gains the axis did not
-        stop oscillating after a disturbance.
-    cause: Emergencies of the drives in a trial that was stopped; "" if there were none.
-    slack: How far the gains keep the dynamics by the model, relative, 0 where they just do; infinite if none were
-        asked for.
+    objectives: Values in the order of `OBJECTIVES`.
+    aborted: Stopped because of an oscillation or a fault.
+    fragile: Rejected because with these gains the axis did not stop oscillating after a disturbance.
+    cause: Emergencies of the drives in a stopped trial; "" without any.
+    slack: Relative slack of the gains to the dynamics by the model, 0 if they are only just kept; infinite without
+        dynamics.
     """
 
     search: int
@@ -113,7 +114,7 @@ class TrialRow(NamedTuple):
 
     @property
     def robust_cost(self) -> float:
-        """The logarithm of the robust cost by J and slack, which goes on where J comes to its end."""
+        """Logarithm of the robust cost by J and slack; it continues to grow where J saturates."""
         if math.isinf(self.slack):
             return self.cost
         judged = robust_cost(np.exp(self.cost), np.array(self.slack))
@@ -121,7 +122,7 @@ class TrialRow(NamedTuple):
 
     @property
     def accepted(self) -> bool:
-        """Whether the gains could be kept."""
+        """Whether the gains may be kept."""
         return not (self.aborted or self.fragile)
 
 
@@ -130,18 +131,18 @@ class Optimised:
     """The result of a search.
 
     Attributes:
-        gains: The best of every machine, raw integers, (num_axes, count); that of the safe search was never stopped.
-            Where dynamics were asked for and no trial was accepted, those of before.
-        rule: The baseline rule's, from what was identified, (num_axes, count).
-        cost: ln J by measured terms of the best, (num_machines,).
-        rows: Every trial, in order.
+        gains: Best gains of every machine, raw integers, shape (num_axes, count); in the safe search, of a trial that
+            was never stopped. With dynamics and without an accepted trial, the gains before.
+        rule: The baseline rule's gains for the identified axes, shape (num_axes, count).
+        cost: ln J by measured terms of the best gains, shape (num_machines,).
+        rows: All trials in order.
         drive_seconds: Time that passed on the drives [s].
-        moves, aborts: Of every axis, (num_axes,).
-        notes: What was in the way, of every machine; "" for nothing.
-        t_0: What the objective speed tells settling times over [s].
-        untried: Proposals that broke the dynamics by the model, which no drive got.
-        margins: Of the gains by the model: phase margin [degrees], gain margin [dB] and Ms of velocity and position
-            loop, (num_axes, 2, 3); nan where no dynamics were asked for.
+        moves, aborts: Counts of every axis, shape (num_axes,).
+        notes: Problems of every machine; "" without any.
+        t_0: Settling time to which the objective speed is relative [s].
+        untried: Number of proposals that broke the dynamics by the model, so that no drive got them.
+        margins: Margins of the gains by the model: phase margin [degrees], gain margin [dB] and Ms of velocity and
+            position loop, shape (num_axes, 2, 3); nan without dynamics.
     """
 
     gains: Integers
@@ -157,7 +158,7 @@ class Optimised:
     margins: Floats
 
     def front(self, objectives: Sequence[str], search: int = 0) -> list[TrialRow]:
-        """Return the accepted trials of a search that no other of them beats in every objective."""
+        """Return a search's accepted trials on the Pareto front of the objectives."""
         return pareto([row for row in self.rows if row.search == search and row.accepted], objectives)
 
 
@@ -170,20 +171,20 @@ def optimise(
     log: ShardLog | None = None,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Optimised:
-    """Search gains; afterwards the drives have the best ones.
+    """Search gains and write the best ones to the drives.
 
     Args:
-        target: What is tuned; the drives may have any gains.
-        settings: How.
-        shared: The machines are one and the same: one search, whose generation fills them.
-        anew: As `TrialBench` takes it.
-        log: Trials that were made already, and where those to come are kept; with `anew` only, and without a journal.
+        target: The target to tune; its drives may have any gains.
+        settings: Settings of the search.
+        shared: The machines are copies of one: a single search tries each generation on all of them.
+        anew: As in `TrialBench`.
+        log: Finished trials of an earlier run, to which new ones are added; only with `anew` and without a journal.
         progress: Called with the share that is done.
 
     Raises:
-        ValueError: For a gain that the device does not have, or a sampler that lacks a package or does not take several
-            objectives; or if dynamics are asked of a drive without a linear model.
-        RuntimeError: If dynamics are asked for, and an axis cannot be identified.
+        ValueError: For a gain that the device does not have, a sampler that lacks a package or does not support several
+            objectives, or dynamics for a drive without a linear model.
+        RuntimeError: If dynamics are requested and an axis cannot be identified.
         ShardLogError: If the log is of another search.
     """
     if log is not None and (not anew or settings.journal is not None):
@@ -191,7 +192,7 @@ def optimise(
             "a search is continued from its log only if every trial starts from rest, and if it has no journal"
         )
     chosen = target.device.gains.outer if settings.gains is None else settings.gains
-    check_tried(target.device, chosen)  # before anything moves
+    check_tried(target.device, chosen)  # checked before anything moves
     columns = target.device.gains.columns(chosen)
     if settings.dynamics is not None:
         check_linear_model(target.device)
@@ -199,7 +200,7 @@ def optimise(
         known = None
         if settings.dynamics is not None:
             began = target.drives.read(cia402.POSITION_ACTUAL)
-            # Copies of one machine are known by the first one.
+            # For copies of one machine, only the first is identified.
             where = np.arange(target.num_axes) < (target.axes_per_machine if shared else target.num_axes)
             known = ModelMargins(watched, find_dynamics(settings.dynamics, settings.inertia_range), where)
             if not anew:
@@ -224,10 +225,10 @@ def optimise(
 
 
 class _Search:
-    """Searches of the machines of a bench, side by side; a point is the logarithms of gains over the rule's.
+    """Simultaneous searches on the machines of a bench; a point is the logarithms of gains over the rule's.
 
-    All axes of a machine have the same factors of their rules: the rule knows what tells the axes apart, and a search
-    of three numbers finds something in twenty trials where one of eighteen does not.
+    All axes of a machine use the same factors: the rule already adapts to the axes, and a search of three numbers
+    succeeds in twenty trials where one of eighteen numbers does not.
     """
 
     def __init__(
@@ -244,7 +245,7 @@ class _Search:
         self.notes = [""] * machines
         self._bench, self._trials, self._settings, self._axes = bench, trials, settings, axes
         self._columns, self._known = columns, known
-        # Machines of a search: they are its generation.
+        # Machines of each search: its generation is tried on all of them.
         self._members = [np.arange(machines)] if shared else [np.array([k]) for k in range(machines)]
         self.untried = [0] * len(self._members)
         start = self._points(bench.safe if settings.safe else bench.rule)
@@ -266,7 +267,7 @@ class _Search:
             self._prove()
 
     def generation(self) -> bool:
-        """Try a generation; return whether there was anything left to try."""
+        """Try a generation; return False if no trials are left."""
         asked, held, slack = {}, {}, {}
         for k, members in enumerate(self._members):
             while (left := self._settings.trials - self._made(k)) > 0 and not self._halted[k]:
@@ -300,7 +301,7 @@ class _Search:
         return min(made) / self._settings.trials if made else 1.0
 
     def best(self) -> tuple[Integers, Floats]:
-        """Return the best gains of every machine, (num_axes, count), and their costs, (num_machines,)."""
+        """Return the best gains of every machine, shape (num_axes, count), and their costs, shape (num_machines,)."""
         bench = self._bench
         start = bench.safe if self._settings.safe else bench.rule
         gains = (start if self._known is None else self._known.before).copy()
@@ -317,13 +318,13 @@ class _Search:
         return gains, cost
 
     def tell_of_swings(self, gains: Integers) -> None:
-        """Add a reservation where the rotor swings with the best gains of a PID at a steady speed."""
+        """Add a reservation if the rotor oscillates at a steady speed with the best gains of a PID."""
         bench = self._bench
         drives = bench.target.drives
         everywhere = np.ones(bench.target.num_axes, bool)
         write_gains(drives, gains)
         bench.trials.recover(everywhere)
-        # There and back from where the trials have left the axes, toward where they began if that is the longer way.
+        # There and back from the present positions, in the direction with the longer remaining way.
         gone = wrapped(drives.read(cia402.POSITION_ACTUAL) - bench.began) / bench.target.increments()
         left = bench.reach - gone
         swings = bench.trials.steady_swings(left, everywhere).reshape(len(STEADY_SPEEDS), bench.num_machines, -1)
@@ -340,7 +341,7 @@ class _Search:
                 self.notes[machine] = "; ".join(filter(None, (self.notes[machine], said)))
 
     def judged(self) -> tuple[TrialRow, ...]:
-        """Return every trial, those marked whose gains were found fragile later."""
+        """Return all trials, with `fragile` set for gains that were found fragile later."""
         return tuple(row._replace(fragile=row.gains.tobytes() in self._fragile[row.search]) for row in self.rows)
 
     def _best_row(self, k: int) -> TrialRow | None:
@@ -355,7 +356,7 @@ class _Search:
 
     # --- a generation -------------------------------------------------------------------------------------------------
     def _run(self, held: dict[int, list[Floats]], slack: dict[int, list[float]]) -> tuple[Tried, Integers]:
-        """Try points of the searches that keep the dynamics, each in a machine of its own."""
+        """Try the points that keep the dynamics, each on its own machine; return results and gains."""
         gains, where = self._bench.incumbent.copy(), np.zeros(self._bench.num_machines, bool)
         for k, points in held.items():
             for machine, point, kept in zip(self._members[k], points, slack[k], strict=False):
@@ -402,11 +403,11 @@ class _Search:
         self.untried[k] += untried
 
     def _made(self, k: int) -> int:
-        """Return how many trials of a search were made."""
+        """Return the number of finished trials of a search."""
         return self._proposers[k].told - self.untried[k]
 
     def _drop_fragile(self, tried: Tried) -> None:
-        """Forget the last good gains where they could not end an oscillation; those before them are the last good."""
+        """Discard the last good gains if they could not end an oscillation; the best earlier ones replace them."""
         for k, members in enumerate(self._members):
             for machine in map(int, members[tried.fragile[members]]):
                 axes = self._axes_of(machine)
@@ -421,7 +422,7 @@ class _Search:
                 )
 
     def _unstopped(self, k: int) -> list[TrialRow]:
-        """Return a search's trials that were not stopped, and whose gains have not been found fragile since."""
+        """Return a search's trials that were not stopped, and whose gains were not found fragile later."""
         return [
             row
             for row in self.rows
@@ -429,7 +430,7 @@ class _Search:
         ]
 
     def _take(self, k: int, point: Floats, row: TrialRow) -> None:
-        """Remember a trial; if it is better than all before and was not stopped, the next ones go back to it."""
+        """Record a trial; if it is the best so far and was not stopped, its gains are the last good ones."""
         self.rows.append(row)
         (self._refuted if row.aborted else self._proved)[k].append(point)
         for machine in map(int, self._members[k]):
@@ -439,7 +440,7 @@ class _Search:
 
     # --- the safe search ----------------------------------------------------------------------------------------------
     def _prove(self) -> None:
-        """Try the safe gains first, slower ones where they are not, and give a machine up that shakes with those."""
+        """Try the safe gains first, then slower ones; end the search of a machine that oscillates with all of them."""
         searches = [k for k in range(len(self._members)) if not self._proved[k]]
         point = {k: self._start[k] for k in searches}
         for _ in range(SAFE_STARTS):
@@ -468,15 +469,16 @@ class _Search:
             )
 
     def _held_back(self, k: int, point: Floats) -> Floats:
-        """Return the point, in the safe search drawn near to proved points and away from refuted ones."""
+        """Return the point; in the safe search moved close to proved points and away from refuted ones."""
         if not self._settings.safe:
             return point
         proved, caution = np.array(self._proved[k]), self._bench.method.caution
         nearest = proved[np.abs(proved - point).max(axis=1).argmin()]
         step = np.clip(point - nearest, -SAFE_STEP, SAFE_STEP)
         for _ in range(SAFE_HALVINGS):
-            # Not beyond gains that oscillated, every one as large, nor currents that lost steps, every one as small;
-            # nor nearer to them than half a step.
+            # Not beyond gains that oscillated (each at least as large) or currents that lost steps (each at most as
+            # large),
+            # nor closer to them than half a step.
             if not any(
                 np.all(caution * (nearest + step - bad) >= 0.0) or np.abs(nearest + step - bad).max() < 0.5 * SAFE_STEP
                 for bad in self._refuted[k]
@@ -507,25 +509,25 @@ class _Search:
         )
 
     def _slack(self, k: int, place: int, point: Floats) -> float:
-        """Return how far gains at a point, of a machine of a search by its place, keep the dynamics by the model."""
+        """Return the slack to the dynamics by the model, of gains at a point on the machine at a place in a search."""
         if self._known is None:
             return math.inf
         members = self._members[k]
         return self._known.slack(self._gains(int(members[place]), point), self._axes_of(members[0]))
 
     def _slowed(self, k: int, point: Floats) -> Floats:
-        """Return a point to start from: with gains halved until they keep the dynamics, or as it is if none do."""
+        """Return a first point with gains halved until they keep the dynamics; unchanged if none of these do."""
         slower = (point - step * math.log(2.0) for step in range(SLOWER))
         return next((one for one in slower if self._slack(k, 0, one) > 0.0), point)
 
     def _points(self, gains: Integers) -> Floats:
-        """Return gains as points of the machines, (num_machines, dimensions)."""
+        """Convert gains to points of the machines, shape (num_machines, dimensions)."""
         known = self._bench.target.device.gains
         logs = known.change(gains, self._bench.rule, self._columns)
         return np.asarray(logs.reshape(self._bench.num_machines, self._axes, len(self._columns)).mean(axis=1))
 
     def _gains(self, machine: int, point: Floats) -> Integers:
-        """Return the gains of a machine's axes at a point, (axes_per_machine, count)."""
+        """Return the gains of a machine's axes at a point, shape (axes_per_machine, count)."""
         known = self._bench.target.device.gains
         return known.changed(self._bench.rule[self._axes_of(machine)], point, self._columns, self._bench.highest)
 
@@ -538,7 +540,7 @@ class _Search:
 
 
 def pareto(rows: Sequence[TrialRow], objectives: Sequence[str]) -> list[TrialRow]:
-    """Return the trials that no other is better than in every objective, ordered by the first one."""
+    """Return the trials on the Pareto front, in the order of the first objective."""
     values = np.array([objective_values(row, objectives) for row in rows]).reshape(len(rows), len(objectives))
     best = [
         k for k, own in enumerate(values) if not np.any(np.all(values <= own, axis=1) & np.any(values < own, axis=1))
@@ -547,15 +549,15 @@ def pareto(rows: Sequence[TrialRow], objectives: Sequence[str]) -> list[TrialRow
 
 
 def objective_values(row: TrialRow, objectives: Sequence[str]) -> tuple[float, ...]:
-    """Return a trial's value in each objective, less is better."""
-    broken = math.log(2.0 - math.exp(min(row.slack, 0.0)))  # as the robust cost counts it
+    """Return a trial's value in each objective; smaller is better."""
+    broken = math.log(2.0 - math.exp(min(row.slack, 0.0)))  # as in the robust cost
     return tuple(
         row.robust_cost if name == COST else row.objectives[OBJECTIVES.index(name)] + broken for name in objectives
     )
 
 
 def _row(search: int, fact: Mapping[str, Any]) -> TrialRow:
-    """Return a trial that a journal remembers."""
+    """Return a trial from its facts in a journal."""
     return TrialRow(
         search,
         int(fact["number"]),
@@ -569,7 +571,7 @@ def _row(search: int, fact: Mapping[str, Any]) -> TrialRow:
 
 
 def _check(what: str, names: Sequence[str], known: Sequence[str]) -> None:
-    """Raise ValueError unless the names are different ones of those known."""
+    """Raise ValueError unless all names are known and different."""
     for name in names:
         if name not in known:
             raise ValueError(f"no {what} is named {name!r}; there are {', '.join(known)}")

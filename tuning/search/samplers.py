@@ -1,8 +1,7 @@
-"""Samplers propose gains: points of a box, a generation at a time, and take their costs.
+"""Samplers propose gains: they yield points of a box, one generation at a time, and receive their costs.
 
-TPE, CMA-ES and Gaussian processes are Optuna's, by ask and tell. Their samplers are made anew for every generation from
-seed and number of the generation, so that a study that was broken off and is taken up again proposes what it would have
-proposed.
+TPE, CMA-ES and Gaussian processes are Optuna's, used by ask and tell. Their samplers are created for every generation
+from the seed and its number, so that an interrupted study, when continued, proposes the same points.
 """
 
 from __future__ import annotations
@@ -24,31 +23,31 @@ from tuning.runs.provenance import check_study
 SAMPLERS = ("random", "grid", "tpe", "cmaes", "gp")
 _NEEDS = {"cmaes": ("cmaes", "cmaes"), "gp": ("torch", "torch")}  # sampler -> module, what pip installs
 _FACTS = "facts"
-STARTUP = 6  # trials of TPE and GP that are drawn at random before the model says anything
+STARTUP = 6  # random trials of TPE and GP before their model is used
 
 
 class Proposer(Protocol):
-    """Points of a box, and their costs."""
+    """Proposes points of a box and receives their values."""
 
     def ask(self, count: int) -> list[Floats]:
-        """Return so many points, or fewer if there are no more."""
+        """Return `count` points, or fewer if no more exist."""
 
     def tell(self, values: Sequence[Sequence[float]], facts: Sequence[Mapping[str, Any]]) -> None:
-        """Take the values of the points asked for last, one row of objectives each, less is better.
+        """Receive the values of the points last asked for, one row of objectives each; smaller is better.
 
-        `facts` is what else is to be remembered of each, as JSON has it.
+        `facts` are further data to store with each point, of JSON types.
         """
 
     def history(self) -> list[Mapping[str, Any]]:
-        """Return the facts of all points that a journal remembers, in their order."""
+        """Return the facts of all points stored in a journal, in order."""
 
     @property
     def told(self) -> int:
-        """How many points have been told."""
+        """Number of points whose values were received."""
 
 
 class Study(NamedTuple):
-    """A study of a journal: its name in there, and as lines of text the subject of its points."""
+    """A study in a journal: its name, and the subject of its points as lines of text."""
 
     name: str = "study"
     subject: str = ""
@@ -70,22 +69,22 @@ def new_proposer(
     journal: Path | None = None,
     study: Study = THE_STUDY,
 ) -> Proposer:
-    """Return a sampler of the box low...high.
+    """Create a sampler of the box low...high.
 
     Args:
         sampler: One of `SAMPLERS`.
-        low: The box's lower ends, shape (dimensions,).
-        high: Its upper ends.
-        seed: Of everything random.
-        objectives: Values of each point.
-        trials: How many points will be asked for; a grid has as many levels as they allow.
-        first: Points that are proposed before all others.
-        generation: How many points are asked for at a time: the population of CMA-ES, if it is 4 or more.
-        journal: File in which Optuna's studies are kept, and from which one that was broken off goes on.
-        study: The study's name in the journal, and its subject: a study of another subject is refused.
+        low: Lower ends of the box, shape (dimensions,).
+        high: Upper ends of the box, shape (dimensions,).
+        seed: Seed of everything random.
+        objectives: Number of values of each point.
+        trials: Number of points that will be asked for; it determines the levels of a grid.
+        first: Points to propose first.
+        generation: Number of points asked for at a time: the population of CMA-ES, if it is 4 or more.
+        journal: File in which Optuna's studies are stored, and from which an interrupted one continues.
+        study: The study in the journal; one with another subject is refused.
 
     Raises:
-        ValueError: For an unknown sampler, one that has one objective only, or one that lacks a package.
+        ValueError: For an unknown sampler, one that supports a single objective only, or one that lacks a package.
     """
     if sampler not in SAMPLERS:
         raise ValueError(f"no sampler is named {sampler!r}; there are {', '.join(SAMPLERS)}")
@@ -100,7 +99,7 @@ def new_proposer(
 
 
 def check_installed(sampler: str) -> None:
-    """Raise ValueError if a package that the sampler needs is missing, with the remedy."""
+    """Raise ValueError, with the remedy, if a package that the sampler needs is missing."""
     module, package = _NEEDS.get(sampler, ("optuna", "optuna"))
     if importlib.util.find_spec(module) is None:
         others = ", ".join(name for name in SAMPLERS if name not in _NEEDS)
@@ -110,13 +109,13 @@ def check_installed(sampler: str) -> None:
 
 
 def load(sampler: str) -> None:
-    """Import a sampler's package, which takes a second or more: too long with an axis enabled."""
+    """Import a sampler's package in advance: it takes a second or more, too long while an axis is enabled."""
     if sampler != "grid":
         importlib.import_module("optuna.samplers")
 
 
 class _Grid:
-    """Every point of a grid, in the order of counting, the given points first."""
+    """The points of a grid in lexicographic order, after the given first points."""
 
     def __init__(self, low: Floats, high: Floats, trials: int, first: Sequence[Floats]) -> None:
         room = max(trials - len(first), 1)
@@ -141,7 +140,7 @@ class _Grid:
 
 
 class _Optuna:
-    """An Optuna study by ask and tell."""
+    """An Optuna study, used by ask and tell."""
 
     def __init__(
         self,
@@ -171,7 +170,7 @@ class _Optuna:
         )
         if journal is not None:
             check_study(self._study, journal, "give another --journal", study.subject)
-        # Points that were asked for when the study was broken off come first.
+        # Points that had been asked for when the study was interrupted come first.
         running = optuna.trial.TrialState.RUNNING
         self._running = [trial._trial_id for trial in self._study.get_trials(deepcopy=False, states=(running,))]
         self._first = list(first)[self.told :]
@@ -188,7 +187,7 @@ class _Optuna:
         points = []
         with self._quiet():
             for place in range(count):
-                # One for each point: what it draws must not depend on how the last generation ended.
+                # A sampler for each point: its random numbers must not depend on how the last generation ended.
                 self._study.sampler = self._new_sampler(told + place)
                 if self._running:
                     trial = self._optuna.trial.Trial(self._study, self._running.pop(0))
@@ -217,7 +216,6 @@ class _Optuna:
 
     @contextmanager
     def _quiet(self) -> Iterator[None]:
-        """Silence Optuna's warnings of experimental features."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", self._optuna.exceptions.ExperimentalWarning)
             yield

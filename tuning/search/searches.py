@@ -1,8 +1,8 @@
-"""Independent searches of the same emulated machine, each with its own seed: the shards into which optimising splits.
+"""Independent searches on the same emulated machine, each with its own seed, as shards of one optimisation.
 
-A search is a sequence of generations, each from what the last one showed, so that it runs in one place. Several with
-other seeds guard against the luck of one, and run anywhere. One that is killed goes on from its last generation where
-its file can be reached, or else from its seed: to the same digits.
+A search is a sequence of generations, each based on the last, so it runs in one process. Several with other seeds
+reduce the influence of chance, and can run anywhere. An interrupted search continues from its last generation if its
+file can be reached, otherwise it starts again from its seed, with identical results.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ from tuning.search.optimise import SAFE_STARTS, Optimised, Settings, TrialRow, o
 from tuning.target import emulated
 from tuning.toml_tables import toml
 
-# Fields of `Optimised` of which a search on copies of one machine has those of one, of all its axes; and of all copies.
+# Fields of `Optimised`. A search on copies of one machine returns those of one copy for OF_AXES, those of all copies
+# for OF_ALL, and sums for SUMS.
 OF_AXES, OF_ALL, SUMS = ("gains", "rule", "margins"), ("moves", "aborts"), ("drive_seconds", "untried")
 
 
@@ -36,7 +37,7 @@ class Search(NamedTuple):
 
 
 class _SearchTask(NamedTuple):
-    """A search to be run, and the file from which it goes on with its key; None without a file."""
+    """A search to run, and the file from which it continues, with its key; None without a file."""
 
     search: Search
     path: Path | None
@@ -44,10 +45,10 @@ class _SearchTask(NamedTuple):
 
 
 def searches(machine: Mapping[str, Any], settings: Settings, count: int) -> list[Search]:
-    """Return searches with the seeds from that of the settings on; the machine is the same.
+    """Return searches of the same machine with consecutive seeds, beginning with that of the settings.
 
     Raises:
-        ValueError: For fewer than one, or several that share a journal.
+        ValueError: For a count below 1, or several searches with one journal.
     """
     if count < 1:
         raise ValueError(f"--searches {count} is below 1; give the number of searches")
@@ -58,7 +59,7 @@ def searches(machine: Mapping[str, Any], settings: Settings, count: int) -> list
 
 
 def description(shards: list[Search]) -> str:
-    """Return the machine and the settings of searches as TOML lines; equal searches have equal lines."""
+    """Describe machine and settings of searches as TOML lines; equal searches have equal lines."""
     lines = [f"searches = {len(shards)}"]
     machine = as_kept(dict(shards[0].machine))
     lines += [f"machine.{name} = {toml(value)}" for name, value in machine.items() if value is not None]
@@ -70,17 +71,17 @@ def description(shards: list[Search]) -> str:
 def run(
     shards: list[Search], pool: Pool | None, log: ShardLog, progress: Callable[[float], None] = lambda share: None
 ) -> list[Optimised]:
-    """Run the searches that are not in the log yet, and return the results of all, in their order.
+    """Run the searches that are not in the log yet, and return the results of all in order.
 
     Args:
         shards: The searches.
-        pool: Where they run; in this process by default. It changes no digit.
-        log: Searches that are done already, and where those to come are kept.
+        pool: Processes that run them, with identical results; None runs them in this process.
+        log: Finished searches of an earlier run, to which new ones are added.
         progress: Called with the share that is done.
     """
     found = dict(log.done)
     left = [k for k in range(len(shards)) if k not in found]
-    # A journal remembers by itself; a cluster's workers do not see this machine's files.
+    # A journal stores the search itself; a cluster's workers cannot access this machine's files.
     here = shards[0].settings.journal is None and (pool is None or pool.shares_disk)
     tasks = [
         _SearchTask(shard, part_path(log, k) if here else None, f"{log.key}search {k}")
@@ -96,7 +97,7 @@ def run(
 def _done(
     tasks: list[_SearchTask], left: list[int], pool: Pool | None, progress: Callable[[float], None]
 ) -> Iterator[tuple[int, Arrays]]:
-    """Give the number and the result of each search as it is done."""
+    """Yield the number and the result of each search when it is done."""
     before = len(tasks) - len(left)
     if pool is None:
         for done, k in enumerate(left, before):
@@ -112,7 +113,7 @@ def _done(
 
 
 def joined(found: list[Optimised]) -> Optimised:
-    """Return searches as one: gains (searches * axes, count) and cost (searches,) of each, counts of all machines."""
+    """Join searches: gains, shape (searches * axes, count), cost, shape (searches,), and counts of all machines."""
     rows = tuple(row for one in found for row in one.rows)
     notes = tuple(note for one in found for note in one.notes)
     every: dict[str, Any] = {
@@ -123,7 +124,7 @@ def joined(found: list[Optimised]) -> Optimised:
 
 
 def _run(task: _SearchTask, progress: Callable[[float], None] = lambda share: None) -> Arrays:
-    """Run a search on the machine that its machines are; return the result as arrays."""
+    """Run a search on copies of its machine; return the result as arrays."""
     search = task.search
     kept = nullcontext() if task.path is None else part_log(task.path, task.key)
     with emulated(**search.machine) as target, kept as log:
@@ -138,7 +139,7 @@ def _run(task: _SearchTask, progress: Callable[[float], None] = lambda share: No
 
 
 def _is_of(task: _SearchTask, arrays: Any) -> bool:
-    """Return whether arrays are what `_run` returns of a search."""
+    """Return whether arrays have the form of `_run`'s result for a task."""
     found = _optimised(arrays, 0)
     trials = len(found.rows) <= task.search.settings.trials + SAFE_STARTS
     return trials and all(one.shape == found.gains.shape for one in (found.rule, *(row.gains for row in found.rows)))
@@ -146,7 +147,7 @@ def _is_of(task: _SearchTask, arrays: Any) -> bool:
 
 def _optimised(arrays: Mapping[str, NDArray[Any]], search: int) -> Optimised:
     columns = [arrays[f"trial {name}"] for name in TrialRow._fields]
-    # Gains stay an array, all else is plain.
+    # Gains stay arrays, all other fields become plain values.
     plain = (column if column.ndim == 3 else column.tolist() for column in columns)
     rows = (TrialRow(*values)._replace(search=search) for values in zip(*plain, strict=True))
     rest: dict[str, Any] = {name: arrays[name] for name in (*OF_AXES, "cost", *OF_ALL)}

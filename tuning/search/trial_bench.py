@@ -1,7 +1,7 @@
-"""Trials of gains on what is to be tuned: identified first, then tried in moves, and costed from what a drive shows.
+"""Trials of gains on a target: it is identified first, then gains are tried in moves, and costed from its signals.
 
-The bench is where optimisers meet drives: it starts from gains that are safe, keeps each axis within its travel, has
-what oscillates stopped within 50 ms, and counts what the drives had to do.
+The bench connects optimisers and drives: it starts from safe gains, keeps each axis within its travel, has an
+oscillating axis stopped within 50 ms, and counts time and moves.
 """
 
 from __future__ import annotations
@@ -35,37 +35,37 @@ from tuning.stop_causes import told_causes
 from tuning.target import Target
 
 MOVES_OF_IDENTIFICATION, MOVES_OF_TRIAL = 2, 3
-CALM = 0.1  # s until what an axis did before has died away
-ASTRAY = 0.2  # of the move: an axis farther than that from where a trial starts is brought back first
-MOST_WAITING = 8  # times as long as a trial, at most, until it is back
-SOFTENINGS = 3  # of gains from the data sheet, with which an axis may oscillate
-MOST_STOPS = 3  # by the safety envelope, one trial after the other, before the search ends
-BEYOND = 0.1  # how fast the cost grows where J has come to its end
+CALM = 0.1  # s until the axis' earlier motion has decayed
+ASTRAY = 0.2  # of the move: an axis farther from the start of a trial is first brought back
+MOST_WAITING = 8  # durations of a trial: longest wait until it is back
+SOFTENINGS = 3  # of gains from the data sheet, if an axis oscillates with them
+MOST_STOPS = 3  # stops of consecutive trials by the safety envelope before the search ends
+BEYOND = 0.1  # slope of the cost above the value at which J saturates
 E_D_EXPONENT = 0.4  # of E_d/E_0 in J (drive_env/trials/score.py)
 _UNCUT = 1e-3
-STALL = 60.0  # s: so long a sampler may think while an axis stands still, enabled
+STALL = 60.0  # s that a sampler may compute while an enabled axis stands still
 
 OBJECTIVES = ("speed", "robustness", "current")
 
 
 def leave_oscillations_to_trials(drives: Drives) -> None:
-    """Keep the envelope from ending a search where a trial stops an axis itself, or the sampler computes for long."""
+    """Keep the envelope from ending a search when a trial itself stops an axis, or the sampler computes for long."""
     if drives.safety is not None:
         drives.safety.change(replace(drives.safety.limits, oscillation=False, stall=STALL))
 
 
 class Tried(NamedTuple):
-    """What a trial of the machines' gains showed.
+    """The result of a trial of gains on the machines.
 
-    cost: ln J by measured terms, of the worst axis of each machine, (num_machines,); above ln 30, where J ends, it goes
-        on growing a tenth as fast.
-    objectives: In the order of `OBJECTIVES`, all to be small, (num_machines, 3): ln t_s/t_0 of the slower of move and
-        reversal; ln of how much worse the worst phase is than move and reversal, the probe with velocity P x 1.5
-        among them; RMS increment of the current over the rated one [%], in open loop the RMS of the currents that are
-        set.
-    aborted: Stopped in any phase, (num_machines,).
-    fragile: Shook on with the incumbent's gains after it had been stopped, (num_machines,): not gains to keep.
-    causes: Emergencies of the machine's drives meanwhile, texts, (num_machines,); "" without one.
+    cost: ln J by measured terms of the worst axis of each machine, shape (num_machines,); above ln 30, where J
+        saturates, it grows at a tenth of the rate.
+    objectives: In the order of `OBJECTIVES`, smaller is better, shape (num_machines, 3): ln t_s/t_0 of the slower of
+        move and reversal; ln of J of the worst phase (with velocity P x 1.5 among them) over the mean J of move and
+        reversal; RMS increment of the current over the rated one [%], in open loop the RMS of the set currents.
+    aborted: Stopped in any phase, shape (num_machines,).
+    fragile: Still oscillating with the last good gains after it had been stopped, shape (num_machines,): these must be
+        discarded.
+    causes: Emergencies of the machine's drives during the trial as text, shape (num_machines,); "" without one.
     """
 
     cost: Floats
@@ -76,17 +76,17 @@ class Tried(NamedTuple):
 
 
 class TrialBench:
-    """Trials of gains on a target, all of its machines at once.
+    """Trials of gains on all machines of a target at once.
 
     Args:
-        target: What is tuned; the drives may have any gains, also none.
-        anew: Put emulated machines to rest at zero before every trial, so that a trial follows from machine, gains
-            and its number alone; drives on a bus go on from where they are.
-        gains: Names of those that will be tried; with one that acts in a closed loop alone the loop is closed.
+        target: The target to tune; its drives may have any gains, even 0.
+        anew: Reset emulated machines to rest at position 0 before every trial, so that its result depends only on
+            machine, gains and its number; drives on a bus continue from their present positions.
+        gains: Names of the gains to be tried; with a gain that acts only in a closed loop, the loop is closed.
 
     Attributes:
-        t_0: Settling times are relative to this [s].
-        began: Where the axes were before their first trial [inc], (num_axes,).
+        t_0: Settling time to which others are relative [s].
+        began: Positions of the axes before their first trial [inc], shape (num_axes,).
     """
 
     def __init__(self, target: Target, *, anew: bool = False, gains: tuple[str, ...] = ()) -> None:
@@ -114,27 +114,27 @@ class TrialBench:
 
     @property
     def trials(self) -> Any:
-        """What runs the trials."""
+        """The runner of the trials."""
         return self._trials
 
     @property
     def reach(self) -> Floats:
-        """How far the rotors may turn from where they began, the longer way, with its sign [rad], (num_axes,)."""
+        """Signed angle from the first positions to the farther end of the travel [rad], shape (num_axes,)."""
         return self._reach
 
     @property
     def origin(self) -> Integers:
-        """Where the next trial starts [inc], (num_axes,)."""
+        """Positions at which the next trial starts [inc], shape (num_axes,)."""
         return self._origin
 
     def identify(self) -> None:
-        """Find inertia and friction with gains from the data sheet alone; plan the moves, the rule's and safe gains."""
+        """Identify inertia and friction with gains from the data sheet; plan the moves, the rule's and safe gains."""
         target, drives = self.target, self.target.drives
         if self._anew:
             machine_of(drives).reset()
         present = read_gains(drives)
         gains = self.method.keep(self.method.first(target.supply), present)
-        write_gains(drives, gains)  # before anything is enabled: the drives may have any
+        write_gains(drives, gains)  # written before anything is enabled: the drives may have any gains
         check_motors(target.drives)
         self._trials.recover(self._where)
         drives.advance(CALM)
@@ -151,20 +151,20 @@ class TrialBench:
         )
         self.incumbent = self.safe.copy()
         write_gains(drives, self.safe)
-        drives.advance(TRIAL * CYCLE)  # the first gains may leave an axis swinging
+        drives.advance(TRIAL * CYCLE)  # with the first gains an axis may still oscillate
         if self.method.measures_current:
             self._fallback.calm = self.safe
 
     @property
     def worst(self) -> tuple[float, ...]:
-        """The objectives of gains of which it is known only that they are no good."""
+        """The values of the objectives for gains that failed completely."""
         return math.log(1.0 + (SETTLED - PROFILE) * CYCLE / self.t_0), math.log(TRIP), 100.0
 
     def _moved(self, gains: Integers) -> tuple[Identified, Integers]:
-        """Move there and back for identification; an axis that oscillates is switched off, and moves with softer gains.
+        """Move there and back for identification; switch off axes that oscillate, and repeat with softer gains.
 
         Raises:
-            RuntimeError: If one oscillates with any.
+            RuntimeError: If an axis oscillates with all of these gains.
         """
         target, drives = self.target, self.target.drives
         if not self.method.measures_current:
@@ -197,27 +197,27 @@ class TrialBench:
         )
 
     def run(self, gains: Integers, where: Mask | None = None) -> Tried:
-        """Try gains in a move, its reversal and the gain probe; what is stopped gets the incumbent back.
+        """Try gains in a move, its reversal and the gain probe; stopped axes get the last good gains back.
 
         Args:
-            gains: Raw integers, shape (num_axes, count) in the order of the device's set.
-            where: Machines that take part, (num_machines,); the others' figures mean nothing.
+            gains: Raw integers in the order of the device's set, shape (num_axes, count).
+            where: Machines that take part, shape (num_machines,); results of the others are meaningless.
         """
         target = self.target
         axes = self._where if where is None else np.repeat(where, target.axes_per_machine)
         self._start_trial()
         self._return(axes)
         self._fallback.begin()
-        told_causes(target.drives)  # of before
+        told_causes(target.drives)  # discards earlier ones
         try:
             tried = self._trials.run(gains, self.incumbent, self.move, self._origin, self._direction, axes)
         except SafetyError as error:  # the envelope has stopped all drives
             return self._stopped(axes, error)
         self._stops = 0
-        # Until the next trial, and not those of the probe.
+        # These gains stay until the next trial, instead of the probe's.
         write_gains(target.drives, np.where(self._fallback.calmed[:, None], self.safe, self.incumbent), axes)
         self._trials.recover(axes)
-        if not (self._anew or self._trials.returns):  # it ends where its move did, and the next one goes the other way
+        if not (self._anew or self._trials.returns):  # the next trial goes back from the end of this move
             self._origin = np.where(axes, self._origin + self._direction * self.move.distance, self._origin)
             self._direction = np.where(axes, -self._direction, self._direction)
         self.moves[axes] += MOVES_OF_TRIAL
@@ -236,13 +236,13 @@ class TrialBench:
         )
 
     def _causes(self) -> NDArray[np.str_]:
-        """Return the emergencies since they were read last, of each machine; what several axes told stands once."""
+        """Return the emergencies of each machine since they were last read, each text once."""
         lanes, told = self.target.axes_per_machine, told_causes(self.target.drives)
         machines = (told[k : k + lanes] for k in range(0, len(told), lanes))
         return np.array([", ".join(dict.fromkeys(filter(None, axes))) for axes in machines], np.str_)
 
     def _stopped(self, axes: Mask, error: SafetyError) -> Tried:
-        """Return the result of a trial that the envelope ended: everything that took part is stopped."""
+        """Return the result of a trial that the envelope ended: all axes that took part are stopped."""
         self._stops += 1
         if self._stops > MOST_STOPS:
             raise error
@@ -261,26 +261,26 @@ class TrialBench:
         )
 
     def _cost(self, gains: Integers, tried: Trial) -> Floats:
-        """Return the cost of every axis, (num_axes,): what is slow beyond J's end is still told from what is slower."""
+        """Return the cost of every axis, shape (num_axes,); even above the saturation of J, slower gains cost more."""
         relative = self.method.softness(gains) / self.method.softness(self.rule)
-        # J is cut off at 30; with less of E_d, which enters as a factor, it is not.
+        # J saturates at 30; with a smaller E_d, which is a factor of J, it does not.
         uncut = tried.costs(relative * _UNCUT) * _UNCUT**-E_D_EXPONENT
         worth = np.log(measured_cost(np.where(tried.aborted, TRIP, uncut)))
         end = np.log(TRIP)
         return np.asarray(np.where(worth > end, end + BEYOND * (worth - end), worth))
 
     def _objectives(self, tried: Trial) -> Floats:
-        """Return the objectives of every axis, (num_axes, 3)."""
+        """Return the objectives of every axis, shape (num_axes, 3)."""
         terms, moves = tried.terms, tried.aborted[:2].any(axis=0)
-        # Of a move that was stopped it is known only that it is no good: the slowest there is.
+        # A stopped move has no settling time: it gets the greatest value.
         speed = np.where(moves, self.worst[0], np.log(terms.settling[:2].max(axis=0)))
-        # Without E_d/E_0, of which a probe with 1.5 times the gain has less in any case.
+        # E_d/E_0 is left out: a probe with 1.5 times the gain always has less of it.
         j = self.method.cost(terms._replace(tripped=tried.aborted))
         worse = np.log(np.where(tried.aborted.any(axis=0), TRIP, j.max(axis=0) / j[:2].mean(axis=0)))
         return np.stack([speed, worse, 100.0 * self.method.current(terms)[:2].mean(axis=0)], axis=-1)
 
     def leave(self, gains: Integers) -> None:
-        """Leave the drives with gains, otherwise as they were found, at standstill."""
+        """Leave the drives with gains, otherwise as they were before, at standstill."""
         drives = self.target.drives
         write_gains(drives, gains)
         for name, values in self._profile.items():
@@ -288,7 +288,7 @@ class TrialBench:
         if (off := ~self._was_enabled).any():
             drives.write(
                 cia402.CONTROLWORD, cia402.SHUTDOWN, where=off
-            )  # shutdown: a set-point is not taken up again when enabled anew
+            )  # Shutdown: the drive does not continue to an old set-point when it is enabled again
         self._trials.leave()
 
     def _start_trial(self) -> None:
@@ -297,7 +297,7 @@ class TrialBench:
         self._trials.recover(self._where)
 
     def _return(self, axes: Mask) -> None:
-        """Bring axes back with the incumbent that are not where the next trial starts: one tripped, and fell or ran."""
+        """Bring axes that tripped and moved away back to the start of the next trial, with the last good gains."""
         drives = self.target.drives
         astray = self._astray(axes)
         if not astray.any():
@@ -305,7 +305,7 @@ class TrialBench:
         write_gains(drives, self.incumbent, astray)
         write_profile(drives, self.move, astray)
         self._trials.go(self._origin, astray)
-        # The ramp takes at most as long as the farthest way at its speed; slow gains then creep against friction.
+        # The ramp takes at most as long as the longest way at its speed; slow gains then creep against friction.
         way = np.abs(wrapped(drives.read(cia402.POSITION_ACTUAL) - self._origin))
         longest = np.max(way / self.move.velocity, where=astray, initial=0.0)
         drives.advance(math.ceil(longest / CYCLE) * CYCLE)
@@ -317,11 +317,11 @@ class TrialBench:
         self._trials.recover(astray)
 
     def _astray(self, axes: Mask) -> Mask:
-        """Return which of the axes are too far from where the next trial starts, (num_axes,)."""
+        """Return the axes that are too far from the start of the next trial, shape (num_axes,)."""
         way = np.abs(wrapped(self.target.drives.read(cia402.POSITION_ACTUAL) - self._origin))
         return np.asarray(axes & (way > ASTRAY * np.maximum(np.abs(self.move.distance), 1)))
 
 
 def first_gains(target: Target) -> Integers:
-    """Return gains from the data sheet alone, shape (num_axes, count)."""
+    """Return gains computed from the data sheet alone, shape (num_axes, count)."""
     return method_of(target.device, target.motor).first(target.supply)

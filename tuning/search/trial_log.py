@@ -1,7 +1,7 @@
-"""Trials of a search, remembered in a file: after the process was killed they are taken from there, not made again.
+"""Trials of a search stored in a file: after an interruption they are read from it instead of repeated.
 
-A search is a function of its seed and of what its trials showed. With those at hand it goes through the same steps
-without moving anything, until it comes to the trial at which it ended, and on from there, to the last digit.
+A search depends only on its seed and the results of its trials. With stored results it repeats the same steps without
+moving anything up to the trial at which it was interrupted, and continues from there with identical results.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from tuning.target import DriveTime
 
 
 class LoggedTrials:
-    """Runs trials on a bench, or takes them from a log.
+    """Runs trials on a bench, or reads them from a log.
 
     Args:
-        bench: Which begins every trial anew, so that a trial does not depend on those before it.
-        clock: Time that passes on the drives, which goes on as well.
-        log: A frame for each call of `run`.
+        bench: A bench that resets the machines before every trial, so that a trial does not depend on earlier ones.
+        clock: Clock of the drives' time, which is advanced as well.
+        log: Log with one frame for each call of `run`.
     """
 
     def __init__(self, bench: TrialBench, clock: DriveTime, log: ShardLog) -> None:
@@ -29,10 +29,10 @@ class LoggedTrials:
         self._number = 0
 
     def run(self, gains: Integers, where: Mask) -> Tried:
-        """Try gains as `TrialBench.run` does.
+        """Try gains as `TrialBench.run`.
 
         Raises:
-            ShardLogError: If the log has another trial in this place.
+            ShardLogError: If the log contains another trial at this position.
         """
         bench, drives = self._bench, self._bench.target.drives
         number, self._number = self._number, self._number + 1

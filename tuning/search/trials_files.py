@@ -1,4 +1,4 @@
-"""The files of a search: every trial as a row, a picture of how it went, and the settings that repeat it."""
+"""The files of a search: all trials as rows, a picture of its progress, and the settings that repeat it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 KEPT, STOPPED, FRAGILE, FRONT = "#0072b2", "#d55e00", "#cc79a7", "black"
-# The title of each objective, less is better; the search itself knows the first three as logarithms.
+# Titles of the objectives; smaller is better. The search itself uses logarithms of the first three.
 TITLES = {COST: "J", "speed": "settles [ms]", "robustness": "worst J over J", "current": "ripple [%]"}
 MEANINGS = {
     COST: "J by measured terms",
@@ -33,14 +33,14 @@ MEANINGS = {
     "current": "ripple of the current [% of rated]",
 }
 
-# Of an open loop, whose drives measure no current: J has other terms, and a current is what was set.
+# Of an open loop, whose drives measure no current: J lacks two terms, and the current is the set one.
 OPEN_LOOP_TITLES = TITLES | {"current": "current [%]"}
 OPEN_LOOP_MEANINGS = MEANINGS | {
     COST: "J by measured terms, without load step and ripple of the current",
     "current": "RMS of the currents that are set [% of rated]",
 }
 
-# Of a stepper's position PID, which does not commutate: no torque current is measured, and the encoder vibrates.
+# Of a stepper's position PID, which does not commutate: no torque current is measured; the encoder's vibration counts.
 PID_TITLES = TITLES | {"current": "vibration [%]"}
 PID_MEANINGS = MEANINGS | {
     COST: "J by measured terms, without load step and ripple of the current",
@@ -56,17 +56,17 @@ _MACHINE = ("device", "motor", "load", "supply", "travel", "axis", "machines", "
 def save(
     found: Optimised, settings: Settings, folder: Path, machine: Mapping[str, Any], versions: Mapping[str, str]
 ) -> None:
-    """Write trials.csv, trials.png, settings.toml and inputs/ into a folder that exists.
+    """Write trials.csv, trials.png, settings.toml and inputs/ into an existing folder.
 
     Args:
-        found: What was found.
-        settings: How it was searched.
-        folder: Where to write.
-        machine: What was searched: options of the command, by the names of `load_options`.
-        versions: What computed it.
+        found: Result of the search.
+        settings: Settings of the search.
+        folder: The folder.
+        machine: The searched machine as options of the command, by the names of `load_options`.
+        versions: Versions of the packages used.
 
     Raises:
-        OSError: If one cannot be written, with its name and the reason.
+        OSError: If a file cannot be written, with its name and the reason.
     """
     table = io.StringIO()
     writer = csv.writer(table)
@@ -92,35 +92,35 @@ def save(
 
 
 def titles(device: str, gains: tuple[str, ...] | None) -> dict[str, str]:
-    """Return the title of each objective, for gains of a device."""
+    """Return the title of each objective for gains of a device."""
     if is_tried_open(device, gains):
         return OPEN_LOOP_TITLES
     return PID_TITLES if is_tried_by_pid(device, gains) else TITLES
 
 
 def is_tried_open(device: str, gains: tuple[str, ...] | None) -> bool:
-    """Return whether gains of a device are tried in open loop: a stepper's, but those of the loop that it closes."""
+    """Return whether gains of a device are tried in open loop: those of a stepper except its closed loop's."""
     known = find_device(device)
     return known.gains.is_open_loop and known.gains.loop_of(gains or ()) is None
 
 
 def is_tried_by_pid(device: str, gains: tuple[str, ...] | None) -> bool:
-    """Return whether gains of a device are those of a stepper's position PID, which measures no torque current."""
+    """Return whether gains of a device belong to a stepper's position PID, which measures no torque current."""
     loop = find_device(device).gains.loop_of(gains or ())
     return loop is not None and loop.is_pid
 
 
 def figures(row: TrialRow, objectives: Sequence[str], t_0: float) -> list[float]:
-    """Return a trial's figure in each objective, in the units of `TITLES`; `t_0` is that of the search [s]."""
+    """Convert a trial's objectives to the units of `TITLES`; `t_0` is that of the search [s]."""
     scales = {COST: 1.0, "speed": 1e3 * t_0, "robustness": 1.0}
     told = dict(zip((COST, *OBJECTIVES), (row.cost, *row.objectives), strict=True))
     return [scales[name] * math.exp(told[name]) if name in scales else told[name] for name in objectives]
 
 
 def load_options(path: str | Path) -> dict[str, Any]:
-    """Return the options of `drive-tune auto` by which a search repeats, from its settings.toml.
+    """Read the options of `drive-tune auto` that repeat a search from its settings.toml.
 
-    Whether the drives are on a bus is not among them: a motor turns only if --bus is said again.
+    --bus is not among them: the user must give it again before a motor turns.
 
     Raises:
         ValueError: If the file cannot be read, or is not of a search.
@@ -135,11 +135,11 @@ def load_options(path: str | Path) -> dict[str, Any]:
         raise ValueError(f"{path} is not from a search; give settings.toml of drive-tune auto")
     check_keys(str(path), table, [*_SEARCH, "machine", "inputs", "versions"], optional=["inputs", "versions", *_SEARCH])
     machine = dict(table["machine"]) if isinstance(table["machine"], dict) else {}
-    for before in ("lanes", "copies"):  # as versions before 0.2 named them
+    for before in ("lanes", "copies"):  # names in versions before 0.2
         if before in machine:
             machine["machines"] = machine.pop(before)
     check_keys(f"{path}: machine", machine, list(_MACHINE), optional=_MACHINE)
-    machine.pop("pace", None)  # what lockstep says
+    machine.pop("pace", None)  # `lockstep` has the same information
     kept = found_again(machine, table.get("inputs"), Path(path).parent)
     machine = {name: value.given if isinstance(value, Input) else value for name, value in kept.items()}
     settings = {name: table[name] for name in _SEARCH if name in table}
@@ -147,7 +147,7 @@ def load_options(path: str | Path) -> dict[str, Any]:
 
 
 def axis_numbers(machine: Mapping[str, Any], count: int) -> list[int]:
-    """Return the numbers of a search's axes in results: chosen ones by their number among all axes of the nodes."""
+    """Return the numbers of a search's axes in results: of chosen axes those among all axes of the nodes."""
     from drive_env.devices import find_device
 
     parts = machine.get("axis")
@@ -162,7 +162,7 @@ def _lines(values: Mapping[str, Any]) -> list[str]:
 
 
 def trials_figure(found: Optimised, settings: Settings, device: str) -> Figure:
-    """Return the searches as a picture: cost by trial, or the first two objectives of every trial with the front."""
+    """Draw the searches: cost by trial, or the first two objectives of every trial with the Pareto front."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -211,7 +211,7 @@ def trials_figure(found: Optimised, settings: Settings, device: str) -> Figure:
 
 
 def _scale(axis: Any, set_scale: Any, name: str) -> None:
-    """Scale an axis of a picture: factors by their logarithm, with plain numbers at the lines."""
+    """Scale an axis of a picture: ratios logarithmically, with plain numbers at the ticks."""
     if name == "current":
         return
     from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
@@ -223,7 +223,7 @@ def _scale(axis: Any, set_scale: Any, name: str) -> None:
 
 
 def _draw_best(axes: Any, rows: list[TrialRow], values: list[float], label: str | None) -> None:
-    """Draw the best accepted trial of a search so far, by trials."""
+    """Draw the best accepted trial so far of a search, by trials."""
     least, best, shown = math.inf, [], math.nan
     for row, value in zip(rows, values, strict=True):
         if row.accepted and row.robust_cost < least:

@@ -1,7 +1,7 @@
-"""The gains of the loop that a stepper's drive may close, found by trials that overload the motor.
+"""Tunes the gains of the closed loop of a stepper drive by trials that overload the motor.
 
-Stop on stall and CoolStep are off meanwhile: the first would end what the loop is to catch up with, the second would
-change the overload. The loop is left open; who closes it finds the gains.
+Stop on stall and CoolStep are off during the trials: the first would stop the motor before the loop can catch up, the
+second would change the overload. The loop is left open; a user who closes it later finds the gains set.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from tuning.stepper.load_detection import LoadDetection
 from tuning.target import Target
 
 TRIALS = 24
-REPEATS = 4  # of the commissioned gains and of what the search found, by which it is decided
+REPEATS = 4  # of the commissioned and of the found gains, by which the better ones are chosen
 BEFORE, AFTER = "J of the closed loop, by commissioning", "J of the closed loop, tuned"
 LOOP_FIGURES = (BEFORE, AFTER)
 
 
 def tune_loop(target: Target, detection: LoadDetection, roles: dict[Role, tuple[int, int]]) -> dict[str, Floats]:
-    """Write the gains of the closed loop into the result of load detection; return `LOOP_FIGURES`, (num_axes,) each.
+    """Write the gains of the closed loop into the result of load detection; return `LOOP_FIGURES`, shape (num_axes,).
 
-    Axes on which no gains are better in trials that are made again keep what they have, with a reservation.
+    Axes whose found gains are not better in repeated trials keep the commissioned ones, with a reservation.
 
     Args:
-        target: The drives, enabled, the loop open.
-        detection: What was found in open loop.
-        roles: The speeds of load detection and CoolStep.
+        target: The drives, enabled, with open loop.
+        detection: Result of load detection in open loop.
+        roles: Objects of the speeds of load detection and CoolStep.
     """
     drives, known = target.drives, target.device.gains
     loop = known.loop_of_kind(LOAD_ANGLE)
@@ -44,7 +44,7 @@ def tune_loop(target: Target, detection: LoadDetection, roles: dict[Role, tuple[
     try:
         if Role.STALL_SPEED in roles:
             drives.write(Role.STALL_SPEED, 0)
-        if lower is not None:  # a CoolStep that works from no speed on works always
+        if lower is not None:  # CoolStep with a start speed of 0 is always active
             drives.write(known.keys[lower], 0)
         found = optimise(target, Settings(trials=TRIALS, gains=names, safe=bool(target.bus)))
         others = _best_others(found, target.axes_per_machine)
@@ -72,7 +72,7 @@ def tune_loop(target: Target, detection: LoadDetection, roles: dict[Role, tuple[
 
 
 def _best_others(found: Optimised, axes: int) -> Integers:
-    """Return the best gains of each machine that are not the commissioned ones, which won by luck where they did."""
+    """Return each machine's best gains other than the commissioned ones, which may have won by noise."""
     gains = found.gains.copy()
     for machine in range(len(found.cost)):
         own = slice(machine * axes, (machine + 1) * axes)
@@ -91,7 +91,8 @@ def _register(target: Target) -> str:
 def _compared(target: Target, names: tuple[str, ...], gains: Integers) -> tuple[Floats, Floats, tuple[Mask, Mask]]:
     """Try the commissioned gains and others again; return the mean ln J of both, and where each was never stopped.
 
-    What won a search won by its noise, too: its trial says too little. One of each goes each way.
+    The best trial of a search was also favoured by its noise, so one trial proves little. Trials alternate in
+    direction.
     """
     bench = TrialBench(target, gains=names)
     bench.identify()

@@ -1,8 +1,9 @@
 """Automatic commissioning of an open-loop stepper: currents, StallGuard threshold, CoolStep; certified or rolled back.
 
-What an engineer does by hand, on all axes at the same time: identify the load by the load angle, set the run current by
-it, move at the working speed, raise the threshold until the load reading is above 0 and falls to 0 before the pull-out,
-let CoolStep take current away, and prove that no step is lost. The state before is in a file before anything changes.
+All axes at the same time go through the steps of manual commissioning: identify the load by the load angle, set the run
+current for it, move at the working speed, raise the threshold until the load reading is above 0 and falls to 0 before
+the pull-out, let CoolStep reduce the current, and prove that no step is lost. The state before is saved to a file
+before anything changes.
 """
 
 from __future__ import annotations
@@ -39,18 +40,18 @@ from tuning.target import Target, timed
 Progress = Callable[[str, float], None]
 Files = Callable[[StepperResult], AbstractContextManager[object]]
 
-WORKING_SHARE = 0.7  # of the motor's corner speed: the current is in full force, and the back-EMF clear
+WORKING_SHARE = 0.7  # of the motor's corner speed: still with full current, and with a clear back-EMF
 ACCELERATION_SHARE = 0.3  # of the holding torque at the run current
-# Both, one after the other for axes that fail: with much friction, or little current, a motor loses steps at the first.
+# Pairs of both, tried in this order for axes that fail: with much friction or little current a motor loses steps.
 WORK = ((WORKING_SHARE, ACCELERATION_SHARE), (0.5, 0.15), (0.35, 0.2))
 MOST_ACCELERATION = 2000.0  # rad/s^2
-PROFILE_SHARE = 0.95  # of the highest acceleration that the drive takes
+PROFILE_SHARE = 0.95  # of the greatest acceleration that the drive accepts
 REACH_SHARE, LONGEST = 0.9, 100.0  # of the travel, and at most [rad]
-MOST_LOST = 3.0  # teeth, until a stall has stopped the motor
+MOST_LOST = 3.0  # teeth until a stall must have stopped the motor
 
 
 def check_stepper(target: Target) -> None:
-    """Import the search's packages; ValueError, before anything moves, for drives without a load detection to set."""
+    """Import the search's packages; ValueError, before anything moves, for drives without adjustable load detection."""
     if lacks := lacks_load_detection(target.device):
         raise ValueError(
             f"{target.device.name}: the load detection of this drive cannot be set: {lacks}; drive-tune sweep and "
@@ -62,18 +63,18 @@ def check_stepper(target: Target) -> None:
 def commission(
     target: Target, file: str | Path, *, keep: bool = True, progress: Progress | None = None, files: Files = nullcontext
 ) -> StepperResult:
-    """Commission the axes of a target; an axis that fails a check is rolled back, and the reason is in the result.
+    """Commission the axes of a target; an axis that fails a check is rolled back, with the reason in the result.
 
     Args:
         target: The drives; they are off afterwards.
         file: File for the state before.
         keep: Whether drives on a bus store the settings.
-        progress: Called with the present step, and the share done.
-        files: As `tuning.auto.one_button.auto` takes it.
+        progress: Called with the present step, and the share that is done.
+        files: As in `tuning.auto.one_button.auto`.
 
     Raises:
-        ValueError: For a drive without load detection, before anything is done.
-        BusError: If the drives cannot be reached any more; OSError if a file cannot be written.
+        ValueError: For a drive without load detection, before anything is written.
+        BusError: If the drives can no longer be reached; OSError if a file cannot be written.
     """
     check_stepper(target)
     say = progress or (lambda what, share: None)
@@ -115,7 +116,7 @@ def commission(
 def _commissioned(
     bench: TrialBench, target: Target, gains: Integers, weakness: Sequence[str], say: Progress
 ) -> tuple[LoadDetection, dict[str, Floats]]:
-    """Return the result at the working speed; of axes that fail there at a lower one, with a note."""
+    """Commission axes at the working speed, those that fail there at a lower one, with a note; return all results."""
     weak = np.array([bool(reason) for reason in weakness])
     detection, figures = _found_at(bench, target, gains, ~weak, WORK[0], say)
     for k in map(int, np.flatnonzero(weak)):
@@ -125,7 +126,7 @@ def _commissioned(
         if not left.any():
             break
         drives = target.drives
-        drives.advance(REACTION)  # one that was given up may be in fault, and brakes
+        drives.advance(REACTION)  # an axis that failed may be in fault and braking
         bench.trials.recover(left)
         write_gains(drives, gains, left)
         other, measured = _found_at(bench, target, gains, left, work, say)
@@ -143,7 +144,7 @@ def _commissioned(
 def _found_at(
     bench: TrialBench, target: Target, gains: Integers, where: Mask, work: tuple[float, float], say: Progress
 ) -> tuple[LoadDetection, dict[str, Floats]]:
-    """Find and prove the settings of some axes at a share of the speed, by ramps of a share of the torque."""
+    """Find and prove the settings of some axes at a share of the speed, with ramps of a share of the torque."""
     speed = work[0] * min(target.speed, target.motor.rated_speed)
     moves = _moves(bench, gains, work[1])
     detection = LoadDetection(target.drives, target.motor, moves, gains, speed)
@@ -169,7 +170,7 @@ def _found_at(
 
 
 def _currents(bench: TrialBench) -> tuple[Integers, list[str]]:
-    """Return the rule's currents, the rated ones where these lose steps in a trial, and why axes fail with those."""
+    """Return the rule's currents, or the rated ones if those lose steps in a trial, and why axes fail with both."""
     axes = bench.target.axes_per_machine
     tried = bench.run(bench.rule)
     gains = np.where(np.repeat(tried.aborted, axes)[:, None], bench.safe, bench.rule)
@@ -187,13 +188,13 @@ def _moves(bench: TrialBench, gains: Integers, share: float) -> WorkingMoves:
     target = bench.target
     torque = share * holding_torque(target.motor, run_and_standby(target.device, gains)[0])
     reach = np.clip(REACH_SHARE * np.nan_to_num(bench.reach, posinf=LONGEST, neginf=-LONGEST), -LONGEST, LONGEST)
-    # The drive's profiles end somewhere, too.
+    # The drive's profiles have a greatest acceleration, too.
     entry = target.device.new_dictionary().find(cia402.PROFILE_ACCELERATION)
     assert entry.high is not None, "an acceleration is a number"
     counts = target.increments() * per_increment(target.drives, cia402.PROFILE_ACCELERATION)
     most = np.minimum(MOST_ACCELERATION, PROFILE_SHARE * entry.high / counts)
     acceleration = np.minimum(torque / bench.identified.inertia, most)
-    # A trial may have ended away from where the axes began; the way is counted from there.
+    # A trial may have ended away from the first positions; the reach counts from those.
     return WorkingMoves(
         target.drives, target.motor, bench.trials, bench.began, reach, acceleration, target.increments(),
         encoder_age(target.device),
@@ -201,7 +202,7 @@ def _moves(bench: TrialBench, gains: Integers, share: float) -> WorkingMoves:
 
 
 def _prove(target: Target, detection: LoadDetection, moves: WorkingMoves, speed: float) -> dict[str, Floats]:
-    """Put load and obstacle on the axes, or add the reservation that this was not done."""
+    """Prove the settings with a load and an obstacle, or add a reservation that this was not done."""
     found = detection.found
     lost = np.full(target.num_axes, np.nan)
     if not can_load(target):
@@ -235,7 +236,7 @@ def _prove(target: Target, detection: LoadDetection, moves: WorkingMoves, speed:
 
 
 def _roles(target: Target) -> dict[Role, tuple[int, int]]:
-    """Return the objects beside the gains that are set."""
+    """Return the objects that are set in addition to the gains."""
     return {
         role: target.device.roles[role]
         for role in (Role.STALL_SPEED, Role.COOLSTEP_SPEED)
@@ -250,15 +251,14 @@ def _leave(
     accepted: Mask,
     roles: dict[Role, tuple[int, int]],
 ) -> None:
-    """Leave the accepted axes with their settings and all else as it was, disabled.
+    """Leave the accepted axes with their settings and everything else restored, disabled.
 
-    A stall above the speed of 20A4h stops them from then on, as it was found; where CoolStep is off its speed is what
-    it was.
+    A stall above their 20A4h speed then stops them; the speed of a CoolStep that is off is restored.
     """
     drives, gains = bench.target.drives, detection.gains
     lower = bench.target.device.gains.column(*LOWER)
     everywhere = np.ones(bench.target.num_axes, bool)
-    if bench.trials.down().any():  # one that was given up is in fault
+    if bench.trials.down().any():  # a failed axis is in fault
         drives.advance(REACTION)
         bench.trials.recover(everywhere)
     motion.disable(drives, where=~bench.trials.down())
@@ -319,7 +319,7 @@ def _axis(
 def _settings(
     k: int, transaction: Transaction, target: Target, roles: dict[Role, tuple[int, int]]
 ) -> dict[str, dict[str, int]]:
-    """Return values before and now of an axis' objects beside the gains; equal ones for an axis that is given up."""
+    """Return the values before and now of an axis' objects other than gains; equal ones for a rejected axis."""
     return {
         f"{index:04X}:{sub:02X}": {
             "before": transaction.before.axes[k][index, sub], "after": int(target.drives.read(role)[k]),

@@ -1,13 +1,14 @@
-"""A StallGuard threshold and a CoolStep setting for the load that an axis has, found by moves at the working speed.
+"""Finds StallGuard threshold and CoolStep settings for the load of an axis by moves at the working speed.
 
-The threshold shifts the load reading. In spread cycle the reading is all but linear in the voltage that a falling phase
-gives back against its current i at speed w, with the load angle d (electrical):
+The threshold shifts the load reading. In spread cycle the reading is nearly linear in the voltage u that a falling
+phase feeds back against its current i at speed w, with the load angle d (electrical):
 
     u = L i n_p w + n_p psi w (cos d - sin d) - R i
 
-How many counts a volt has is not published; two speeds tell it, since L and psi are the data sheet's. The threshold is
-then raised until the reading of the axis' own load is what lies between its load angle and `STALL_ANGLE`: the reading
-falls to 0 there, before the motor falls out of step at 90 degrees. CoolStep lowers the current down to `COOL_ANGLE`.
+The reading per volt is not published; moves at two speeds give it, since L and psi are known from the data sheet. Then
+the threshold is raised until the reading at the axis' own load equals the difference between the readings at its load
+angle and at `STALL_ANGLE`: the reading falls to 0 there, before the motor loses steps at 90 degrees. CoolStep lowers
+the current until the load angle is `COOL_ANGLE`.
 """
 
 from __future__ import annotations
@@ -44,24 +45,28 @@ from drive_env.trials.working_moves import Steady, WorkingMoves
 from mechanics.arrays import Floats, Integers, Mask
 from tuning.stop_causes import stop_causes, told_causes
 
-COOL_ANGLE = math.radians(30.0)  # down to which CoolStep takes current away
-CLEAR = 3.0  # standard deviations, by which a reading must be above 0
-LEAST_MARGIN = 16.0  # counts of the reading, that an axis' own load must be above 0
-SHARE_AT_STOP_SPEED = 0.5  # of the margin, that is left at the speed above which a stall stops
+COOL_ANGLE = math.radians(30.0)  # load angle up to which CoolStep reduces the current
+CLEAR = 3.0  # standard deviations that a reading must be above 0
+LEAST_MARGIN = 16.0  # counts of the reading that an axis' own load must be above 0
+SHARE_AT_STOP_SPEED = 0.5  # of the margin that must be left at the speed above which a stall stops the axis
 LEAST_STOP_SPEED = 0.5  # of the working speed
-COOL_UNIT = 32.0  # counts of the reading of a step of CoolStep's thresholds
-COOL_WIDTH, COOL_DOWN, COOL_UP = 2, 2, 3  # width of the band, 2 readings for a step down, 8 steps up for one below it
-COOL_RAISES = 3  # of the lower threshold, where steps were lost
+COOL_UNIT = 32.0  # counts of the reading per step of CoolStep's thresholds
+COOL_WIDTH, COOL_DOWN, COOL_UP = 2, 2, 3  # width of the band, 2 readings per step down, 8 steps up per reading below it
+COOL_RAISES = 3  # of the lower threshold, if steps were lost
 
 
 @dataclass
 class Found:
-    """The settings found for the axes, (num_axes,) each; nan and 0 without a result.
+    """The settings found for the axes, each of shape (num_axes,); nan without a result.
 
-    per_volt: Counts of the reading of a volt given back. margin: Reading of the axis' own load with the threshold.
-    wanted: What that was to be. speed: The working speed [rad/s]. angle: Load angle at the working speed [rad].
-    stop_speed: Above which a stall stops [rad/s]. saved: Share of the current that CoolStep took away, by the load
-    angle. reasons: Why axes were given up.
+    per_volt: Counts of the reading per volt fed back.
+    margin: Reading at the axis' own load with the threshold.
+    wanted: Wanted margin.
+    speed: Working speed [rad/s].
+    angle: Load angle at the working speed [rad].
+    stop_speed: Speed above which a stall stops the axis [rad/s].
+    saved: Share of the current that CoolStep saved, computed from the load angles.
+    reasons: Why axes were rejected, "" for others.
     """
 
     speed: Floats
@@ -77,34 +82,34 @@ class Found:
 
     @classmethod
     def nothing(cls, count: int) -> Found:
-        """Return it before anything was found."""
+        """Return an instance without results."""
         s, a, b, c, d, e, f, g = (np.full(count, np.nan) for _ in range(8))
         return cls(s, a, b, c, d, e, f, g, [""] * count, [[] for _ in range(count)])
 
     def going(self) -> Mask:
-        """Return which axes have not been given up."""
+        """Return which axes have not been rejected."""
         return np.array([not reason for reason in self.reasons])
 
     def reject(self, where: Mask, reason: str) -> None:
-        """Give axes up."""
+        """Reject axes with a reason, except those already rejected."""
         for k in map(int, np.flatnonzero(where & self.going())):
             self.reasons[k] = reason
 
 
 class LoadDetection:
-    """Finds the settings on drives that moves turn; `gains` are the drives' own, raw, (num_axes, count)."""
+    """Finds the settings of drives in moves; `gains` are the drives' present ones, raw, shape (num_axes, count)."""
 
     def __init__(self, drives: Drives, motor: Motor, moves: WorkingMoves, gains: Integers, speed: float) -> None:
         self.gains = gains.copy()
         self.found = Found.nothing(drives.num_axes)
         self.found.speed[:] = speed
-        moves.trials.acts_by_load = True  # from now on that is what is set
+        moves.trials.acts_by_load = True  # from now on load detection is active in moves
         self._drives, self._motor, self._moves, self._speed = drives, motor, moves, speed
         self._known: GainSet = device_of(drives).gains
         self._run, _ = run_and_standby(device_of(drives), gains)
 
     def take(self, other: LoadDetection, where: Mask) -> None:
-        """Take the settings of some axes from other moves."""
+        """Replace the results of some axes by those of other moves."""
         self.gains = np.where(where[:, None], other.gains, self.gains)
         self._run = np.where(where, other._run, self._run)
         for row in fields(Found):
@@ -116,7 +121,7 @@ class LoadDetection:
 
     # --- the threshold ------------------------------------------------------------------------------------------------
     def find_threshold(self) -> None:
-        """Set the threshold by which the reading falls to 0 at `STALL_ANGLE`, and the speed above which it stops."""
+        """Set the threshold for a reading of 0 at `STALL_ANGLE`, and the speed above which a stall stops the axis."""
         found = self.found
         self._write_stop_speed(np.zeros_like(self._run))
         if has_coolstep(device_of(self._drives)):
@@ -143,7 +148,7 @@ class LoadDetection:
         self._write_stop_speed(np.where(found.going(), found.stop_speed, 0.0))
 
     def _lifted(self, speed: float) -> Steady:
-        """Return moves at a speed with the threshold so high that the reading is not 0."""
+        """Move at a speed with the threshold so high that no reading is 0, and return the result."""
         column = self._column(THRESHOLD)
         while True:
             steady = self._run_moves(speed)
@@ -160,7 +165,7 @@ class LoadDetection:
             self._set(THRESHOLD, np.where(low, self.gains[:, column] + LIFT, self.gains[:, column]))
 
     def _raise_threshold(self, fast: Steady) -> None:
-        """Find the least threshold with the reading that is wanted; a step of it shifts all readings alike."""
+        """Find the smallest threshold with the wanted reading; one step of it shifts all readings equally."""
         found, column = self.found, self._column(THRESHOLD)
         row = self._known.rows[column]
         first = self.gains[:, column].astype(float)
@@ -208,7 +213,7 @@ class LoadDetection:
             for k in map(int, np.flatnonzero(failed)):
                 found.reservations[k].append("CoolStep is left off: with it the axis lost steps or stopped")
         found.cooled_angle = np.where(failed, np.nan, cooled.settled)
-        # The torque is the same: the current is as much less as the sine of the load angle is more.
+        # The torque is the same: the current falls as the sine of the load angle rises.
         found.saved = np.where(failed, np.nan, 1.0 - np.sin(plain.settled) / np.sin(cooled.settled))
         for k in map(int, np.flatnonzero(found.going() & ~failed & ~(found.saved > 0.05))):
             found.reservations[k].append(
@@ -216,7 +221,7 @@ class LoadDetection:
             )
 
     def leave_coolstep_off(self, where: Mask, why: str) -> None:
-        """Switch CoolStep off again, with a reservation."""
+        """Switch CoolStep off, with a reservation."""
         self._set(LOWER, np.where(where, 0, self.gains[:, self._column(LOWER)]))
         for k in map(int, np.flatnonzero(where)):
             self.found.reservations[k].append(f"CoolStep is left off: {why}")
@@ -224,7 +229,7 @@ class LoadDetection:
 
     # --- drives -------------------------------------------------------------------------------------------------------
     def prove(self) -> None:
-        """Move with everything on: an axis that stops or loses steps is given up."""
+        """Move with all settings active: reject an axis that stops or loses steps."""
         where = self.found.going()
         last = self._move(self._speed)
         self._reject_stopped(where & last.stopped, "it was stopped in a move with its own load")
@@ -238,11 +243,11 @@ class LoadDetection:
         return steady
 
     def _move(self, speed: float) -> Steady:
-        told_causes(self._drives)  # of before
+        told_causes(self._drives)  # discards earlier ones
         return self._moves.run(speed, self.found.going())
 
     def _reject_stopped(self, where: Mask, reason: str) -> None:
-        """Give axes up that went into fault in the last move, with their drives' emergencies."""
+        """Reject axes that went into fault in the last move, with their drives' emergencies."""
         causes = stop_causes(self._drives) if where.any() else []
         for k in np.flatnonzero(where):
             self.found.reject(np.arange(len(where)) == k, f"{reason}: {causes[k]}")

@@ -1,4 +1,4 @@
-"""A load and an obstacle on the axis, of emulated machines alone: whether a stall stops the motor in time."""
+"""Puts a load and an obstacle on axes of emulated machines: proves that a stall stops the motor in time."""
 
 from __future__ import annotations
 
@@ -17,21 +17,23 @@ from tuning.linked_axes import are_independent
 from tuning.stop_causes import told_causes
 from tuning.target import Target
 
-OBSTACLE = 1.3  # of the holding torque at the run current: more than the motor can move
-# s in which load and obstacle come. Faster is not what it seems: a load of 30 % within 5 ms or less is a stall to the
-# drive, and an obstacle that comes at once, being a torque and no wall, throws the rotor back by ten teeth and more.
+OBSTACLE = 1.3  # times the holding torque at the run current: more than the motor can move
+# s, rise times of load and obstacle. Faster ones are not realistic: the drive takes a load of 30 % within 5 ms for a
+# stall, and a sudden obstacle, which is a torque and no wall, throws the rotor back by ten teeth and more.
 RISE, OBSTACLE_RISE = 0.15, 0.03
-REACTION = 0.3  # s that a fault reaction takes at most
-AFTER = 0.05  # s at constant speed until the obstacle is there
-STALL = "stall"  # in what a drive says by itself
+REACTION = 0.3  # s, greatest duration of a fault reaction
+AFTER = 0.05  # s at constant speed until the obstacle begins
+STALL = "stall"  # word in the drive's emergency
 
 
 @dataclass(frozen=True)
 class ObstacleProof:
-    """The reaction of the axes to load and obstacle, (num_axes,) each.
+    """The reaction of the axes to load and obstacle, each of shape (num_axes,).
 
-    withstood: Neither stopped nor lost steps with the acceptable load. causes: What the drives told meanwhile, "" for
-    nothing. stopped: Stopped by a stall at the obstacle. lost: Whole teeth (four full steps) that were lost until then.
+    withstood: The axis neither stopped nor lost steps with the acceptable load.
+    causes: Emergencies of the drives during the proof, "" without any.
+    stopped: A stall stopped the axis at the obstacle.
+    lost: Whole teeth (four full steps) lost until then.
     """
 
     withstood: Mask
@@ -41,7 +43,7 @@ class ObstacleProof:
 
 
 def can_load(target: Target) -> bool:
-    """Return whether a torque can be put on every axis by itself: emulated machines whose axes move independently."""
+    """Return whether each axis can be loaded separately: only emulated machines whose axes move independently."""
     from mechanics.shaft import one
 
     machine = target.drives.machine
@@ -49,7 +51,7 @@ def can_load(target: Target) -> bool:
 
 
 def why_not_loaded(target: Target) -> str:
-    """Return why no torque can be put on an axis by itself."""
+    """Return why the axes cannot be loaded separately."""
     if target.drives.machine is None:
         return "nothing puts a load on an axis here"
     return f"the axes of {target.machine} move one another, so that no load is one axis' alone"
@@ -59,9 +61,9 @@ def prove_with_load(target: Target, moves: WorkingMoves, speed: float, run: Floa
     """Move with the acceptable load, then against an obstacle; the axes are enabled again afterwards.
 
     Args:
-        target: Emulated machines, as `can_load` has them.
+        target: Emulated machines for which `can_load` is true.
         moves: Moves at the working speed.
-        speed: That [rad/s].
+        speed: Working speed [rad/s].
         run: Amplitudes of the run current [A].
         where: Axes that take part.
     """
@@ -78,8 +80,8 @@ def prove_with_load(target: Target, moves: WorkingMoves, speed: float, run: Floa
 
             return moves.run(speed, where, load, until_stopped=True)
 
-    told_causes(drives)  # of before
-    # A load that comes by and by: the rotor would swing in its field by a sudden one.
+    told_causes(drives)  # discards earlier ones
+    # The load rises slowly: a sudden one would make the rotor oscillate in its field.
     loaded = with_torque(np.full(target.num_axes, LOAD_SHARE * motor.rated_torque), ramp, RISE)
     drives.advance(REACTION if loaded.stopped.any() else SETTLE)
     moves.trials.recover(where)
@@ -99,7 +101,7 @@ def prove_with_load(target: Target, moves: WorkingMoves, speed: float, run: Floa
 
 @contextmanager
 def _loading(target: Target) -> Iterator[Callable[[Floats], None]]:
-    """Give a function that puts torques on the axes as their rotors see them: of a machine of one axis at its load."""
+    """Yield a function that sets torques at the rotors; on machines with one axis they act on the load."""
     machine = machine_of(target.drives)
     if target.axes_per_machine > 1:
         with machine.pushed() as push:
@@ -117,7 +119,7 @@ def _loading(target: Target) -> Iterator[Callable[[Floats], None]]:
 
 
 def _lever(target: Target) -> Floats:
-    """Return how a torque on the load turns the rotor of its axis."""
+    """Return the transmission ratio from a torque on the load to the rotor of each axis."""
     from mechanics.shaft import one, way
 
     packed = one(machine_of(target.drives).load)

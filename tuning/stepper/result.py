@@ -1,4 +1,4 @@
-"""The result of commissioning a stepper, axis by axis, as the certificate has it."""
+"""The result of commissioning a stepper, axis by axis, and its certificate."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ CERTIFICATE = "stepper-certificate.json"
 
 @dataclass(frozen=True)
 class StepperAxis:
-    """The result of one axis; figures are None where they were not measured.
+    """The result of one axis; figures are None if they were not measured.
 
     Attributes:
         before, after: Gains by name.
-        reason: Why it was rejected; "" where it was not.
-        reservations: What could not be proved, or is near a limit.
-        figures: What was measured, by name with its unit.
-        settings: Objects beside the gains, by "index:sub" (hexadecimal): raw values before and after.
+        reason: Why it was rejected; "" if it was accepted.
+        reservations: Properties that could not be proved or are close to a limit.
+        figures: Measured values by name with unit.
+        settings: Objects other than gains, by "index:sub" (hexadecimal): raw values before and after.
     """
 
     before: dict[str, int]
@@ -43,12 +43,12 @@ class StepperAxis:
 
     @property
     def accepted(self) -> bool:
-        """Whether all checks passed, with reservations or without."""
+        """Whether all checks passed, with or without reservations."""
         return not self.reason
 
     @property
     def verdict(self) -> str:
-        """Which of `tuning.certificate.certificate.VERDICTS` it is."""
+        """The entry of `tuning.certificate.certificate.VERDICTS` that applies to the axis."""
         return verdict(self.accepted, self.reservations)
 
 
@@ -57,15 +57,16 @@ class StepperResult:
     """The result of a run.
 
     Attributes:
-        axes: Of the target.
-        device, motor, machine: What was commissioned.
-        speed: The working speed [rad/s].
+        axes: Results of the target's axes.
+        device, motor, machine: Names of what was commissioned.
+        speed: Working speed [rad/s].
         drive_seconds: Time that passed on the drives [s].
-        file: The state before.
+        file: File with the state before.
         kept: Whether drives on a bus stored the settings.
-        numbers: What each axis is called; its place by default.
-        inputs: Its user's files, as `Target` has them.
-        proved_with_load: Whether load and obstacle were put on the axis: emulated machines of independent axes only.
+        numbers: Number of each axis; its index by default.
+        inputs: The user's own files, as in `Target`.
+        proved_with_load: Whether load and obstacle were put on the axes: only on emulated machines with independent
+            axes.
     """
 
     axes: tuple[StepperAxis, ...]
@@ -82,11 +83,11 @@ class StepperResult:
 
     @property
     def accepted(self) -> Mask:
-        """Which axes passed, (num_axes,)."""
+        """Axes that passed, shape (num_axes,)."""
         return np.array([axis.accepted for axis in self.axes])
 
     def as_dict(self) -> dict[str, Any]:
-        """Return it for JSON."""
+        """Return the result as plain values for JSON."""
         return {
             "device": self.device,
             "motor": self.motor,
@@ -115,13 +116,13 @@ class StepperResult:
 
 
 def figure(value: float) -> float | None:
-    """Return a number as the certificate has it: None for one that was not measured."""
+    """Round a number for the certificate; None for nan, which means not measured."""
     return float(f"{value:.5g}") if math.isfinite(value) else None
 
 
 @contextmanager
 def certificate_file(result: StepperResult, folder: Path) -> Iterator[Path]:
-    """Write the certificate with a hash over its content, complete or not at all; removed if the block fails."""
+    """Write the certificate with a hash over its content, completely or not at all; remove it if the block fails."""
     from drive_env.whole_file import content_hash, write_whole
 
     path = folder / CERTIFICATE

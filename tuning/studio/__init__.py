@@ -1,5 +1,6 @@
 """The pages Commission and Tune of `drive-env studio`: a path to a certificate; gains by hand, responses, rules, auto.
 
-`tune_desk.py` is what all pages of a session share; `tune_jobs.py` asks the drives; `tune_page.py` and the cards are
-what people see. Other packages add tuners of their own as parts (`drive_env.studio_parts`), which get the `TunerCard`.
+`tune_desk.py` is the state that all pages of a session share; `tune_jobs.py` has the jobs on the drives; `tune_page.py`
+and the cards are the user interface. Other packages add tuners as parts (`drive_env.studio_parts`), which get the
+`TunerCard`.
 """

@@ -1,4 +1,4 @@
-"""The commissioning of a session, and the jobs of its page, each a function of the drives."""
+"""The commissioning of a session, and the jobs of its page, which run in the drives' thread."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ if TYPE_CHECKING:
 
 
 class CommissioningRoom:
-    """What the pages of one session share of a commissioning.
+    """The state of a commissioning that the pages of one session share.
 
     Args:
         session: The drives.
 
     Attributes:
-        desk: What is known of the machine, and of its gains.
-        plan: What the user wants.
-        path: The commissioning under way, or that ended well; None without one.
-        page: The page that began it: it lasts no longer than that page.
-        methods: Homing methods of the drives, each with what it does.
+        desk: State of the page Tune: machine and gains.
+        plan: The user's plan.
+        path: The present commissioning, or the last one that ended with success; None without one.
+        page: Page that began it: it ends with that page.
+        methods: Homing methods of the drives, each with its description.
         told: How the last one ended; "" before.
     """
 
@@ -61,7 +61,7 @@ class CommissioningRoom:
         return job
 
     def run(self, name: str) -> Callable[[Drives], None]:
-        """Return the job that does a step; where it is stopped, or the bus fails, everything is as before."""
+        """Return the job that runs a step; a stop or a bus error ends the commissioning and restores everything."""
 
         def job(drives: Drives) -> None:
             path = self._path()
@@ -89,12 +89,12 @@ class CommissioningRoom:
         return job
 
     def leave(self, page: str, why: str) -> None:
-        """End the commissioning of a page that is gone."""
+        """End the commissioning of a closed page."""
         if self.path is not None and self.page == page:
             self.desk.session.do(lambda drives: self.end(why), "End of the commissioning")
 
     def end(self, why: str) -> None:
-        """End the commissioning, in the drives' thread: unless it was kept, they are off and have what they had."""
+        """End the commissioning in the drives' thread: unless it was kept, the drives are switched off and restored."""
         path, self.path = self.path, None
         if path is None:
             return
@@ -119,7 +119,7 @@ _rooms: weakref.WeakKeyDictionary[Session, CommissioningRoom] = weakref.WeakKeyD
 
 
 def room_of(session: Session) -> CommissioningRoom:
-    """Return the commissioning of a session, the same for all of its pages."""
+    """Return the commissioning of a session, the same for all its pages."""
     if session not in _rooms:
         _rooms[session] = CommissioningRoom(session)
     return _rooms[session]

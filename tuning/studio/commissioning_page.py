@@ -20,14 +20,14 @@ from tuning.studio.commissioning_jobs import room_of
 from tuning.studio.tune_panel import TunePanel, card, machine_card
 
 REFRESH = 0.2  # s
-SIGNS = {  # of a state: a sign for who sees no colours, and the class of its colour
+SIGNS = {  # for each state: a sign that needs no colour, and a CSS class
     "pending": ("○", ""), "running": ("◔", "is-lit"), "done": ("✓", "is-accepted"), "failed": ("✕", "is-rejected"),
     "skipped": ("»", ""),
 }  # fmt: skip
 
 
 def build(session: Session, visitor: Visitor) -> None:
-    """Make the page, or say why these drives cannot be commissioned."""
+    """Build the page, or explain why these drives cannot be commissioned."""
     if session.description.device is not None:
         CommissioningPage(TunePanel(session, visitor)).build()
         return
@@ -42,7 +42,7 @@ class CommissioningPage:
     """The controls of one page.
 
     Args:
-        panel: Its drives, and what is known of the machine.
+        panel: Drives and state of the page.
     """
 
     def __init__(self, panel: TunePanel) -> None:
@@ -51,7 +51,7 @@ class CommissioningPage:
         self._seen: Any = None
 
     def build(self) -> None:
-        """Make it."""
+        """Build the page."""
         ui.add_head_html('<link rel="stylesheet" href="/studio/assets/pages.css">')
         with ui.element("div").classes("studio-commission"):
             with ui.element("div").classes("studio-stack"):
@@ -83,13 +83,13 @@ class CommissioningPage:
 
     async def _stop(self) -> None:
         session = self.panel.session
-        if session.job is not None and not session.job.quiet:  # which puts everything back on its way out
+        if session.job is not None and not session.job.quiet:  # it restores everything when it ends
             session.end_job("the commissioning was stopped from a page")
             return
         await self.panel.visitor.do(lambda drives: self.room.end("it was stopped"), "End of the commissioning")
 
     def _show(self) -> None:
-        """Draw the steps anew where any has another state."""
+        """Draw the steps again if the state of one has changed."""
         path, room = self.room.path, self.room
         states = None if path is None else tuple(path.states.values())
         seen = (id(path), states, room.told)
@@ -127,7 +127,7 @@ class CommissioningPage:
         return is_over and not step.unfit(path.bench.target)
 
     def _details(self, step: CommissioningStep, path: CommissioningPath) -> None:
-        """Say what the next step is about, ask what it must know, and offer to do it."""
+        """Describe the next step, ask for its settings, and offer to run it."""
         moves = "The motor turns." if step.moves else "Nothing moves."
         ui.label(f"Look at: {step.look}{'' if step.look.endswith('?') else '.'}")
         ui.label(f"Measured: {step.measured}. {moves}")
@@ -166,7 +166,7 @@ class CommissioningPage:
         self.room.plan.limits = others | ({name: text} if text.strip() else {})
 
     def _methods(self) -> None:
-        """Offer the homing methods that the drive has, each with its sketch."""
+        """Offer the homing methods of the drive, each with its sketch."""
         plan = self.room.plan
         choices = {0: "Leave 6098h as it is"} | {number: f"Method {number}" for number in self.room.methods}
         chosen = ui.radio(choices, value=plan.method or 0).props("inline data-test=methods")

@@ -1,4 +1,4 @@
-"""The card of gains: a slider and a number for each, its value in SI, undo, and the way back to the state before."""
+"""The card of gains: slider, number and SI value of each, undo, and restoring the state before."""
 
 from __future__ import annotations
 
@@ -18,25 +18,25 @@ if TYPE_CHECKING:
     from drive_env.devices import Device
     from drive_env.devices.gain_set import Gain
 
-STOPS = 400  # of a slider, from the least to the greatest integer in equal ratios
+STOPS = 400  # of a slider, logarithmic from the least to the greatest integer
 
 
 def place_of(value: int, highest: int) -> int:
-    """Return where a slider stands for a gain; 0 is the gain 0, the rest goes in equal ratios from 1 on."""
+    """Return the slider position for a gain; 0 is the gain 0, the others are logarithmic from 1."""
     if value <= 0:
         return 0
     return 1 + round((STOPS - 1) * math.log(min(value, highest)) / math.log(max(2, highest)))
 
 
 def value_at(place: int, highest: int) -> int:
-    """Return the gain of a slider's place; the inverse of `place_of` as far as there are places."""
+    """Return the gain for a slider position: the inverse of `place_of`, except for rounding."""
     if place <= 0:
         return 0
     return min(highest, round(math.exp((place - 1) / (STOPS - 1) * math.log(max(2, highest)))))
 
 
 def si_texts(device: Device, supply: float, gains: tuple[int, ...]) -> list[str]:
-    """Return each gain in SI with its unit, "" where nothing is known of it."""
+    """Format each gain in SI units; "" for gains that cannot be converted."""
     try:
         values = dict(zip(SI_UNITS, gains_in_si(device, supply, gains), strict=True))
     except (ValueError, ZeroDivisionError):
@@ -64,14 +64,14 @@ class GainCard:
         self._panel = panel
         self._slid = slid
         self._device = panel.device
-        self.shown: tuple[int, ...] = ()  # in the drive
+        self.shown: tuple[int, ...] = ()  # gains in the drive
         self._is_setting = False
-        self.wanted: list[int] = []  # as the sliders stand, before they are let go
-        self._moved: set[int] = set()  # columns of sliders that are being moved: what is read leaves them alone
+        self.wanted: list[int] = []  # values of the sliders, before they are released
+        self._moved: set[int] = set()  # columns of sliders that are being moved: readings do not change them
         self._controls: list[tuple[Gain, ui.slider, ui.number, ui.label]] = []
 
     def build(self) -> None:
-        """Make it."""
+        """Build the card."""
         with card("Gains", "gains"):
             with ui.element("div").classes("studio-gains"):
                 for column, gain in enumerate(self._device.gains.rows):
@@ -108,7 +108,7 @@ class GainCard:
         self.preview((*self.wanted[:column], value, *self.wanted[column + 1 :]), slid=column)
 
     def preview(self, gains: tuple[int, ...], slid: int | None = None) -> None:
-        """Show gains while a slider is moved, the one of column `slid` or another; written when it is let go."""
+        """Show gains while a slider is moved (written on release); `slid` is its column, None on another card."""
         self._is_setting = True
         for column, (value, (gain, slider, number, _)) in enumerate(zip(gains, self._controls, strict=True)):
             if value != self.wanted[column] or column == slid:
@@ -126,14 +126,14 @@ class GainCard:
             await self.write({column: int(value)})
 
     async def write(self, gains: dict[int, int], what: str = "") -> None:
-        """Write gains by column, as one change, `what` in its history: the gain's old and new value by default."""
+        """Write gains by column as one change; `what` names it, by default the gain with its old and new value."""
         panel, changed = self._panel, {k: value for k, value in gains.items() if value != self.shown[k]}
         if changed:
             titles = [f"{self._controls[k][0].title} {self.shown[k]} to {value}" for k, value in changed.items()]
             self.wanted = [changed.get(k, value) for k, value in enumerate(self.wanted)]
             job = tune_jobs.set_gains(panel.desk, panel.axis, changed, what or titles[0])
             await panel.visitor.do(job, what or titles[0])
-        # What was moved on meanwhile stays as it is.
+        # A slider that was moved again during the writing is not reset.
         self._moved -= {k for k, value in gains.items() if self.wanted[k] == value}
         if changed:
             self.show(force=True)
@@ -151,7 +151,7 @@ class GainCard:
             panel.visitor.say(f"{count} parameters restored; the axes are off", "done")
 
     def show(self, *, force: bool = False) -> None:
-        """Show the gains as they are."""
+        """Show the present gains."""
         desk, axis = self._panel.desk, self._panel.axis
         if desk.gains is None or axis >= len(desk.gains):
             return

@@ -33,7 +33,7 @@ HINT = "Press Measure: the motor turns for about two seconds."
 
 
 def margin_text(value: float, digits: int, unit: str) -> str:
-    """Return a margin for people."""
+    """Format a margin for display."""
     if math.isnan(value):
         return "not measured"
     tail = "" if unit == "1" else f" {unit}" if unit != "°" else "°"
@@ -41,7 +41,7 @@ def margin_text(value: float, digits: int, unit: str) -> str:
 
 
 def margin_rows(sets: Mapping[str, Loops], dynamics: Dynamics) -> tuple[list[str], list[tuple[str, ...]]]:
-    """Return titles and rows of margins by loop, those before beside those now; what dynamics forbid has a cross."""
+    """Return titles and rows of margins by loop, with those before; values below the dynamics are marked by a cross."""
     found: dict[str, Margins] = {}
     for name in response_charts.COLOURS:
         for told, loops in reversed([*sets.items()]):
@@ -63,7 +63,7 @@ class ResponseCard:
 
     Args:
         panel: The page.
-        stiffness: Its slider from soft to stiff.
+        stiffness: The slider from soft to stiff.
     """
 
     def __init__(self, panel: TunePanel, stiffness: StiffnessSlider) -> None:
@@ -71,7 +71,7 @@ class ResponseCard:
         self._seen: tuple[Any, ...] = (None,)
 
     def build(self) -> None:
-        """Make it."""
+        """Build the card."""
         panel = self._panel
         with card("Frequency response, soft to stiff", "response"):
             try:
@@ -101,7 +101,7 @@ class ResponseCard:
         await panel.visitor.do(job, f"Frequency response of axis {panel.axis}", paced=False)
 
     def _sets(self, gains: tuple[int, ...]) -> dict[str, Sequence[int]]:
-        """Return gains, and those to compare them with: the present ones under a slider, else those before them."""
+        """Return gains and those to compare: the present ones under a slider, else those before the last change."""
         desk, axis = self._panel.desk, self._panel.axis
         present = gains if desk.gains is None else tuple(map(int, desk.gains[axis]))
         if present != gains:

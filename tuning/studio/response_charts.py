@@ -1,4 +1,4 @@
-"""Charts of a measured response: Bode, Nichols with the region that the open loop must not enter, predicted step."""
+"""Charts of a measured response: Bode, Nichols with the forbidden region of the open loop, predicted step."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ PHASES, GAINS = (-300.0, -60.0), (-30.0, 30.0)  # of Nichols' chart [degrees], [
 
 
 def loops_of(measured: MeasuredLoop, axis: int, sets: Mapping[str, Sequence[int]]) -> dict[str, Loops]:
-    """Return the loops with sets of gains; those of a position loop alone as it was measured."""
+    """Return the loops with sets of gains; a measured position loop is returned as it is."""
     if measured.fits[axis] is None:
         f, L, trusted = measured.refined(axis)
         return {"": Loops(f, np.full(len(f), np.nan, complex), L, trusted)}
@@ -29,12 +29,12 @@ def loops_of(measured: MeasuredLoop, axis: int, sets: Mapping[str, Sequence[int]
 
 
 def bode(sets: Mapping[str, Loops]) -> dict[str, Any]:
-    """Return Bode's chart of loops; those before are dashed."""
+    """Return the options of a Bode chart; loops of the second set are dashed."""
     lines = []
     for dashes, (told, one) in enumerate(sets.items()):
         for name, colour in COLOURS.items():
             gain, phase = _in_decibels(getattr(one, name), one.trusted)
-            phase = np.where(np.abs(np.diff(phase, prepend=phase[:1])) > 180.0, np.nan, phase)  # where it wraps
+            phase = np.where(np.abs(np.diff(phase, prepend=phase[:1])) > 180.0, np.nan, phase)  # a gap at each wrap
             for panel, values in enumerate((gain, phase)):
                 lines.append(charts.ChartLine(f"{name} loop{told}", one.f, values, panel, colour, dashes))
     ends = next(iter(sets.values())).f[[0, -1]]
@@ -45,7 +45,7 @@ def bode(sets: Mapping[str, Loops]) -> dict[str, Any]:
 
 
 def nichols(sets: Mapping[str, Loops], dynamics: Dynamics) -> dict[str, Any]:
-    """Return Nichols' chart of loops, and the region that dynamics forbid around 0 dB and -180 degrees."""
+    """Return the options of a Nichols chart, with the region that dynamics forbid around 0 dB and -180 degrees."""
     phase, gain = dynamics.region()
     title = f"forbidden by {limits_of(dynamics)}"
     half = len(phase) // 2
@@ -63,11 +63,11 @@ def nichols(sets: Mapping[str, Loops], dynamics: Dynamics) -> dict[str, Any]:
     lines.append(charts.ChartLine("0 dB", PHASES, [0.0, 0.0], 0, 7, 2, 1.0))
     lines.append(charts.ChartLine("0 dB", [-180.0, -180.0], GAINS, 0, 7, 2, 1.0))
     found = charts.options([charts.ChartPanel("gain [dB]", *GAINS)], "phase [°]", lines)
-    return found | {"tooltip": {"show": False}}  # a curve that goes back and forth has no value of its own at a phase
+    return found | {"tooltip": {"show": False}}  # a curve that goes back and forth has no unique value at a phase
 
 
 def step(measured: MeasuredLoop, axis: int, sets: Mapping[str, Sequence[int]]) -> dict[str, Any]:
-    """Return the chart of the steps that a response predicts with sets of gains; a loop that is unstable has none."""
+    """Return the chart of the predicted steps with sets of gains; a set with an unstable loop has none."""
     lines = []
     for dashes, (told, gains) in enumerate(sets.items()):
         found = predicted_step(measured, gains, axis)
@@ -82,13 +82,13 @@ def step(measured: MeasuredLoop, axis: int, sets: Mapping[str, Sequence[int]]) -
 
 
 def limits_of(dynamics: Dynamics) -> str:
-    """Return the margins that dynamics ask for, in words."""
+    """Return the margins that dynamics ask for, as text."""
     name = "" if "/" in dynamics.name else f"{dynamics.name}: "
     return f"{name}{dynamics.phase_deg:.3g}°, {dynamics.gain_db:.3g} dB, Ms {dynamics.ms:.3g}"
 
 
 def _in_decibels(open_loop: Any, trusted: Any) -> tuple[Any, Any]:
-    """Return gain [dB] and phase [degrees], -360 to 0, of an open loop where it is trusted."""
+    """Return gain [dB] and phase [degrees], -360 to 0, of an open loop; nan where it is not trusted."""
     L = np.where(trusted & np.isfinite(open_loop) & (open_loop != 0.0), open_loop, np.nan)
     with np.errstate(invalid="ignore"):
         return 20.0 * np.log10(np.abs(L)), (np.degrees(np.angle(L)) + 360.0) % 360.0 - 360.0

@@ -1,4 +1,4 @@
-"""The card of identification and rules: values with their intervals, and each rule's proposal, side by side."""
+"""The card of identification and rules: values with their intervals, and the proposals of all rules."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from tuning.compare.side_by_side import AxisRules
     from tuning.identify.identified_axis import Identification
 
-LONG = 14  # letters from which a cell is a text rather than a figure
+LONG = 14  # least length of a cell that is laid out as text instead of a number
 
 
 def identified_rows(found: Identification) -> list[tuple[str, str, str]]:
@@ -46,7 +46,7 @@ class RulesCard:
         self._seen: tuple[int, int] = (0, 0)
 
     def build(self) -> None:
-        """Make it."""
+        """Build the card."""
         panel = self._panel
         with card("Identification and rules", "rules"):
             try:
@@ -125,7 +125,7 @@ class RulesCard:
 
 
 def table(head: Sequence[str], rows: Sequence[tuple[str, ...]]) -> None:
-    """Make a table; the first column names its rows."""
+    """Build a table; the first column has the names of its rows."""
     with ui.element("table").classes("studio-table"):
         with ui.element("thead"), ui.element("tr"):
             for text in head:

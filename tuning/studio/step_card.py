@@ -1,4 +1,4 @@
-"""The card of step responses: a step recorded with the present gains, over the last five."""
+"""The card of step responses: a step recorded with the present gains, above the last five."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ KINDS = {"velocity": ("csv", "Velocity step"), "position": ("pp", "Move")}
 
 
 def step_chart(steps: list[StepRecording]) -> dict[str, Any]:
-    """Return the chart of steps, the newest first: strong, the last one with other gains dashed, others faint."""
+    """Return the chart of steps, the newest first: strong, the reference dashed, older ones faint."""
     if not steps:
         panels = [charts.ChartPanel("actual value"), charts.ChartPanel("current [A]")]
         return charts.options(panels, "t [s]", [], hint="Press Record: a step with the present gains.")
@@ -45,7 +45,7 @@ class StepCard:
         self._newest: StepRecording | None = None
 
     def build(self) -> None:
-        """Make it."""
+        """Build the card."""
         panel = self._panel
         state = panel.visitor.state
         modes = () if state is None else state.modes
@@ -98,7 +98,7 @@ class StepCard:
         await panel.visitor.do(job, f"Step of axis {panel.axis}")
 
     def show(self) -> None:
-        """Show the steps there are."""
+        """Show the recorded steps."""
         if not hasattr(self, "_chart"):
             return
         desk, axis = self._panel.desk, self._panel.axis
@@ -107,7 +107,7 @@ class StepCard:
         )
         if newest is not None and newest is not self._newest:
             self._newest = newest
-            self._kind.set_value(newest.kind)  # what was recorded last is what is looked at
+            self._kind.set_value(newest.kind)  # select the kind of the last recording
         steps = desk.last_steps(axis, str(self._kind.value))
         seen = (self._kind.value, *(step.at for step in steps))
         if seen == self._seen:
@@ -127,7 +127,7 @@ class StepCard:
 
 
 def _sample(age: int) -> str:
-    """Return a piece of a line as the chart draws it."""
+    """Return an SVG sample of a line in the chart."""
     dashes = charts.DASHES[age % len(charts.DASHES)]
     array = "" if isinstance(dashes, str) else f' stroke-dasharray="{" ".join(map(str, dashes))}"'
     return (

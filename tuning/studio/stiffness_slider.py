@@ -1,4 +1,4 @@
-"""The slider from soft to stiff: the gains of a whole cascade in one control, by the measured velocity loop."""
+"""The slider from soft to stiff: sets all gains of a cascade by its measured velocity loop."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ STOPS = 100
 
 
 class StiffnessSlider:
-    """The slider of the axis of one page; as the sliders of gains it shows while it moves, and writes when let go.
+    """The slider for the axis of one page; like the sliders of gains it shows while moving, and writes when released.
 
     Args:
         panel: The page.
-        gains: Its gains.
+        gains: Card of the page's gains.
     """
 
     def __init__(self, panel: TunePanel, gains: GainCard) -> None:
@@ -34,7 +34,7 @@ class StiffnessSlider:
 
     @property
     def designed(self) -> SoftToStiff | str:
-        """What the slider goes through, or the reason why there is nothing."""
+        """The gains of the slider, or the reason why there are none."""
         desk, axis = self._panel.desk, self._panel.axis
         if ("velocity", axis) not in desk.responses:
             return "No response of the velocity loop yet: press Measure, and the slider has gains from soft to stiff."
@@ -42,12 +42,12 @@ class StiffnessSlider:
 
     @property
     def dynamics(self) -> Dynamics:
-        """The dynamics that the slider stands at; the usual ones where it has no gains."""
+        """The dynamics at the slider's position; the default ones if it has no gains."""
         designed = self.designed
         return find_dynamics(DEFAULT) if isinstance(designed, str) else designed.dynamics(self._place / STOPS)
 
     def build(self) -> None:
-        """Make it."""
+        """Build the slider."""
         names = list(known_dynamics())
         with ui.element("div").classes("studio-stiffness"):
             self._slider = ui.slider(min=0, max=STOPS, value=self._place, step=1)
@@ -76,7 +76,7 @@ class StiffnessSlider:
             self.show()
 
     def show(self) -> None:
-        """Show where the present gains are on the slider."""
+        """Move the slider to the position of the present gains."""
         designed, now = self.designed, self._gains.shown
         if (id(designed), now) == self._seen:
             return

@@ -28,13 +28,13 @@ if TYPE_CHECKING:
     from tuning.response.measured_loop import MeasuredLoop
 
 
-LAST = 5  # step responses under the present one
-MOST_STEPS = 1000  # changes of gains that can be taken back one by one
+LAST = 5  # step responses shown below the present one
+MOST_STEPS = 1000  # changes of gains that can be undone one by one
 
 
 @dataclass(frozen=True)
 class GainChange:
-    """A change of an axis' gains that can be taken back: raw integers before and after, and its cause."""
+    """A change of an axis' gains that can be undone: raw integers before and after, and its name."""
 
     axis: int
     before: tuple[int, ...]
@@ -44,19 +44,19 @@ class GainChange:
 
 @dataclass(frozen=True, eq=False)
 class StepRecording:
-    """A step that was recorded with the gains of its time.
+    """A step recorded with the gains at that time.
 
     Attributes:
-        axis: Of the axis.
+        axis: Number of the axis.
         kind: "velocity" or "position".
-        gains: Raw, of the axis; empty where they were rejected.
-        unit: Of demand and actual.
-        t: [s], shape (n,).
-        demand, actual: Shape (n,).
-        current: [A], shape (n,).
-        figures: In words: rise, overshoot, settling.
-        source: The tuner that moved; "" for a step that a page asked for.
-        at: When [s since 1970].
+        gains: Raw gains of the axis; empty for rejected ones.
+        unit: Unit of demand and actual.
+        t: Times [s], shape (n,).
+        demand, actual: Set-point and actual value, shape (n,).
+        current: Actual current [A], shape (n,).
+        figures: Rise time, overshoot, settling time as text.
+        source: Tuner that made the move; "" for a step requested on a page.
+        at: Time of the recording [s since 1970].
     """
 
     axis: int
@@ -73,20 +73,20 @@ class StepRecording:
 
     @property
     def name(self) -> str:
-        """Time of day and gains, which tell it from others."""
+        """Time of day and gains, as a unique name."""
         gains = ", ".join(map(str, self.gains)) or "rejected gains"
         source = f"{self.source}: " if self.source else ""
         return f"{time.strftime('%H:%M:%S', time.localtime(self.at))}  {source}{gains}"
 
 
 def reference_of(steps: Sequence[StepRecording]) -> StepRecording | None:
-    """Return the first of steps, the newest first, with other gains than the newest one; None without one."""
+    """Return the newest step with other gains than the first; None without one. Steps must be sorted, newest first."""
     return next((step for step in steps if step.gains != steps[0].gains), None)
 
 
 @dataclass(frozen=True)
 class AxisVerdict:
-    """The verdict of a run on an axis, for people."""
+    """The verdict of a run on an axis, for display."""
 
     axis: int
     verdict: str
@@ -99,18 +99,18 @@ class AxisVerdict:
 
 @dataclass
 class TunerSession:
-    """A run of a tuner, under way or over.
+    """A running or finished run of a tuner.
 
     Attributes:
-        title: Which tuner.
-        folder: Where its files go.
-        lines: What it said, in order.
-        columns: Titles of the trials' columns.
-        trials: Rows of them, as they come.
-        share: How much is done.
+        title: Name of the tuner.
+        folder: Folder of its files.
+        lines: Its messages in order.
+        columns: Titles of the table of trials.
+        trials: Rows of this table so far.
+        share: Share that is done.
         is_over: Whether it has ended.
-        verdicts: Of the axes, once it came to its end.
-        failure: Why it did not.
+        verdicts: Verdicts of the axes after a complete run.
+        failure: Why it did not complete; "" otherwise.
     """
 
     title: str
@@ -126,7 +126,7 @@ class TunerSession:
 
 @dataclass
 class MachineEntries:
-    """A user's entries about the machine: the motor, how far it may turn, supply, how axes belong together."""
+    """A user's entries about the machine: motor, travel, supply, and coupling of the axes."""
 
     motor: str = ""
     travel: str = ""
@@ -141,12 +141,12 @@ class TuneDesk:
         session: The drives.
 
     Attributes:
-        entries: What people say of the machine.
-        gains: Of every axis as they were read or written last, shape (num_axes, count); None before.
-        changes: Of gains, the newest last.
-        before: The parameters before this page first changed anything.
-        before_file: Where they are.
-        version: Grows whenever something that is shown has changed.
+        entries: The user's entries about the machine.
+        gains: Raw gains of every axis, last read or written, shape (num_axes, count); None before.
+        changes: Changes of gains, the newest last.
+        before: The parameters before the first change by this page; None before that.
+        before_file: The file of these.
+        version: Increases whenever displayed data change.
     """
 
     def __init__(self, session: Session) -> None:
@@ -158,7 +158,7 @@ class TuneDesk:
         self.before_file: Path | None = None
         self.steps: deque[StepRecording] = deque(maxlen=10 * (LAST + 1))
         self.responses: dict[tuple[str, int], MeasuredLoop] = {}
-        self.soft_to_stiff: dict[int, SoftToStiff | str] = {}  # of axes, or the reason why there are no such gains
+        self.soft_to_stiff: dict[int, SoftToStiff | str] = {}  # by axis, or the reason for missing gains
         self.identified: list[Identification] = []
         self.rules: list[AxisRules] = []
         self.run: TunerSession | None = None
@@ -167,18 +167,18 @@ class TuneDesk:
 
     @property
     def is_emulated(self) -> bool:
-        """Whether there are machines behind the drives."""
+        """Whether the drives are emulated."""
         return self.session.is_emulated
 
     def touch(self) -> None:
-        """Note that something has changed."""
+        """Increase the version: displayed data have changed."""
         with self._lock:
             self.version += 1
 
     def last_steps(self, axis: int, kind: str) -> list[StepRecording]:
-        """Return the present step of an axis and five before it, the newest first; its reference is the second.
+        """Return the present step of an axis and five before it, newest first, with the reference in second place.
 
-        That is the newest one with other gains than the present step has.
+        The reference is the newest step with other gains than the present one.
         """
         mine = [step for step in reversed(self.steps) if (step.axis, step.kind) == (axis, kind)]
         reference = reference_of(mine)
@@ -196,12 +196,12 @@ class TuneDesk:
         self.touch()
 
     def last_change(self, axis: int) -> GainChange | None:
-        """Return the newest change of an axis."""
+        """Return the newest change of an axis; None without one."""
         return next((change for change in reversed(self.changes) if change.axis == axis), None)
 
     # --- for jobs, in the thread of the drives ----------------------------------------------------------------------
     def address(self) -> Mapping[str, Any]:
-        """Return how the drives of the bus are opened again, empty for emulated ones."""
+        """Return the options that open the drives of the bus again; empty for emulated ones."""
         if self.is_emulated:
             return {}
         from drive_env.master.open_drives import default_nodes
@@ -212,7 +212,7 @@ class TuneDesk:
         return address_of(interface, given.pop("channel", None), nodes, given)
 
     def keep_before(self, drives: Drives) -> Snapshot:
-        """Return the parameters before the first change, which are in a file before anything is changed."""
+        """Return the parameters before the first change; the first call reads them and saves them to a file."""
         if self.before is None or self.before_file is None:
             file = run_folder("studio", RUNS) / "before.toml"
             check_place(file)
@@ -224,10 +224,10 @@ class TuneDesk:
 
     @contextmanager
     def target(self, drives: Drives) -> Iterator[Target]:
-        """Give the drives as tuners take them; on a bus the envelope holds them to their travel meanwhile.
+        """Yield the drives as a target; on a bus the envelope limits them to their travel during the block.
 
         Raises:
-            ValueError: For a motor, a travel or a coupling that cannot be.
+            ValueError: For an invalid motor, travel or coupling.
         """
         from tuning.commands.options import parse_travels
 
@@ -256,7 +256,7 @@ _desks: weakref.WeakKeyDictionary[Session, TuneDesk] = weakref.WeakKeyDictionary
 
 
 def desk_of(session: Session) -> TuneDesk:
-    """Return the desk of a session, the same for all of its pages."""
+    """Return the desk of a session, the same for all its pages."""
     if session not in _desks:
         _desks[session] = TuneDesk(session)
     return _desks[session]

@@ -1,4 +1,4 @@
-"""The jobs of the page Tune, each a function of the drives."""
+"""The jobs of the page Tune, which run in the drives' thread."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ if TYPE_CHECKING:
 
 
 CYCLE = 0.001  # s
-QUIET, LONGEST = 0.02, 10.0  # s before a step; of a move
-AFTER = 0.15  # s that a step is looked at once it is over
-SAFE_TO_STOP = 0.95  # share of a run from which it is written down and kept: nothing stops it any more
+QUIET, LONGEST = 0.02, 10.0  # s at rest before a step; longest move
+AFTER = 0.15  # s that are recorded after a step
+SAFE_TO_STOP = 0.95  # share of a run from which it can no longer be stopped, since its results are being stored
 
 
 # --- gains ------------------------------------------------------------------------------------------------------------
@@ -48,10 +48,10 @@ def look(desk: TuneDesk) -> Callable[[Drives], None]:
 
 
 def set_gains(desk: TuneDesk, axis: int, wanted: dict[int, int], what: str) -> Callable[[Drives], None]:
-    """Return the job that writes some gains of an axis, by their columns, as one step of the history.
+    """Return the job that writes some gains of an axis, by their columns, as one change in the history.
 
     Raises:
-        ValueError: In the job, for an integer outside the gain's range; nothing is written then.
+        ValueError: Raised by the job for an integer outside the gain's range; nothing is written then.
     """
 
     def job(drives: Drives) -> None:
@@ -73,7 +73,7 @@ def set_gains(desk: TuneDesk, axis: int, wanted: dict[int, int], what: str) -> C
 
 
 def undo(desk: TuneDesk, axis: int) -> Callable[[Drives], str]:
-    """Return the job that takes back the newest change of an axis' gains."""
+    """Return the job that undoes the newest change of an axis' gains, and returns its name."""
 
     def job(drives: Drives) -> str:
         change = desk.last_change(axis)
@@ -93,9 +93,9 @@ def undo(desk: TuneDesk, axis: int) -> Callable[[Drives], str]:
 
 
 def restore_before(desk: TuneDesk) -> Callable[[Drives], int]:
-    """Return the job that brings every axis to rest, and back to the parameters before the first change.
+    """Return the job that brings every axis to rest, and restores the parameters before the first change.
 
-    It returns how many parameters were changed.
+    The job returns the number of changed parameters.
     """
 
     def job(drives: Drives) -> int:
@@ -117,13 +117,13 @@ def restore_before(desk: TuneDesk) -> Callable[[Drives], int]:
 
 # --- steps ------------------------------------------------------------------------------------------------------------
 def record_velocity_step(desk: TuneDesk, axis: int, rpm: float, hold: float) -> Callable[[Drives], StepRecording]:
-    """Return the job that records a velocity step there and back in csv, with the present gains.
+    """Return the job that records a velocity step in both directions in csv, with the present gains.
 
     Args:
-        desk: Keeps the recording.
-        axis: The axis; axes that drive one part move together.
+        desk: Stores the recording.
+        axis: Number of the axis; linked axes move together.
         rpm: Height of the step.
-        hold: How long the speed is held each way [s].
+        hold: Duration in each direction [s].
     """
 
     def job(drives: Drives) -> StepRecording:
@@ -151,7 +151,7 @@ def record_velocity_step(desk: TuneDesk, axis: int, rpm: float, hold: float) -> 
 
 
 def record_move(desk: TuneDesk, axis: int, turns: float) -> Callable[[Drives], StepRecording]:
-    """Return the job that records a move in pp with the drive's own profile, with the present gains, and moves back."""
+    """Return the job that records a move in pp with the drive's profile and the present gains, and moves back."""
 
     def job(drives: Drives) -> StepRecording:
         with desk.target(drives) as target:
@@ -187,7 +187,7 @@ def _cycles(duration: float) -> int:
 
 
 def _direction(target: Target, where: Mask, way: float, what: str) -> Floats:
-    """Return the direction in which each axis has the longer way; ValueError where it is too short."""
+    """Return the direction in which each axis has more room; ValueError if it is too small."""
     forwards = target.high >= -target.low
     room = np.where(forwards, target.high, -target.low)
     short = np.flatnonzero(where & (room < way))
@@ -202,7 +202,7 @@ def _direction(target: Target, where: Mask, way: float, what: str) -> Floats:
 
 @contextmanager
 def _moving(drives: Drives, where: Mask, mode: str) -> Iterator[None]:
-    """Enable axes in a mode, at rest; afterwards they are as they were, off or enabled in their mode."""
+    """Enable axes in a mode at rest; restore their state, off or enabled in their mode, at the end."""
     on = np.asarray(cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED)) & where
     names = {number: name for name, number in cia402.MODES.items()}
     modes = [names.get(int(number)) for number in drives.read(cia402.MODE)]
@@ -211,7 +211,7 @@ def _moving(drives: Drives, where: Mask, mode: str) -> Iterator[None]:
     else:
         drives.write(cia402.TARGET_VELOCITY, 0, where=where)
     motion.enable(drives, mode=mode, where=where, timeout=3.0)
-    yield  # what raises leaves the axes to the session, which stops them
+    yield  # after an error the session stops the axes
     for axis in map(int, np.flatnonzero(where)):
         before = modes[axis]
         if not on[axis]:
@@ -258,7 +258,7 @@ def _keep(desk: TuneDesk, step: StepRecording) -> StepRecording:
 def measure_response(desk: TuneDesk, axis: int, loop: str) -> Callable[[Drives], MeasuredLoop]:
     """Return the job that measures a loop's frequency response with the present gains.
 
-    By that of the velocity loop it designs gains from soft to stiff; nothing of them is written.
+    From a velocity loop it also designs gains from soft to stiff, without writing them.
     """
 
     def job(drives: Drives) -> MeasuredLoop:
@@ -278,7 +278,7 @@ def measure_response(desk: TuneDesk, axis: int, loop: str) -> Callable[[Drives],
 
 
 def _fill_slider(desk: TuneDesk, target: Target, axis: int) -> None:
-    """Design the gains of the slider by the response of an axis's velocity loop; a stop leaves it without."""
+    """Design the gains of the slider from the response of an axis' velocity loop; a stop removes them."""
     desk.soft_to_stiff[axis] = "Gains from soft to stiff are being designed by this response."
     desk.touch()
     try:
@@ -323,14 +323,14 @@ def identify_axes(desk: TuneDesk) -> Callable[[Drives], None]:
 
 
 def rest(drives: Drives) -> None:
-    """Bring every axis to rest and switch it off: experiments begin so."""
+    """Bring every axis to rest and switch it off, as experiments require."""
     for axis in range(drives.num_axes):
         if cia402.is_live(int(drives.read(cia402.STATUSWORD)[axis])):
             disable(axis)(drives)
 
 
 def progress_of(desk: TuneDesk, what: str) -> Callable[[float], None]:
-    """Return a callback for the share done: the page shows it, and a job that was stopped ends."""
+    """Return a callback for the share that is done: the page shows it, and a stopped job ends in it."""
 
     def tell(share: float) -> None:
         desk.session.tell(what, share)
@@ -344,12 +344,12 @@ def progress_of(desk: TuneDesk, what: str) -> Callable[[float], None]:
 def run_tuner(
     desk: TuneDesk, run: TunerSession, work: Callable[[Target, TunerSession, Callable[[str, float], None]], Any]
 ) -> Callable[[Drives], None]:
-    """Return the job of a tuner: from rest, to a verdict, or back to the state before.
+    """Return the job of a tuner: brings the axes to rest, tunes, and stores the verdict, or restores the state before.
 
     Args:
-        desk: Keeps the gains.
-        run: What it says.
-        work: Tunes a target; given the run and what it tells its progress, it returns a result with `axes`.
+        desk: Stores the gains.
+        run: Stores messages and verdict.
+        work: Tunes a target; called with target, run and progress, it returns a result with `axes`.
     """
 
     def job(drives: Drives) -> None:
@@ -380,7 +380,7 @@ def run_tuner(
         finally:
             run.is_over = True
             desk.touch()
-        # The verdict stands by now: a stop from here on leaves the slider empty, and the run as it is.
+        # The run has its verdict: a stop from here on only leaves the slider without gains.
         for axis in measured:
             _fill_slider(desk, target, axis)
 
@@ -399,15 +399,15 @@ def _progress(desk: TuneDesk, run: TunerSession) -> Callable[[str, float], None]
 
 
 def _keep_measured(desk: TuneDesk, target: Target, result: Any, title: str) -> list[int]:
-    """Keep what auto measured: its moves, that with the present gains last, and the response of the axes returned."""
+    """Store auto's recordings, with the present gains' moves last, and responses; return the axes with a response."""
     from tuning.auto.certify import recorded_moves
     from tuning.auto.result import Result
 
     if not isinstance(result, Result):
-        return []  # that of a stepper's commissioning has none
+        return []  # the result of a stepper's commissioning has no recordings
     increments, kept = target.increments(), []
     for k, axis in enumerate(result.axes):
-        # The gains of the new move where the axis was rejected are those that did not stay.
+        # If the axis was rejected, the gains of the new move are no longer in the drive.
         moves = [(one, (axis.after if axis.accepted else ()) if one.tuned else axis.before)
                  for one in recorded_moves(result, k)]  # fmt: skip
         for one, gains in moves if axis.accepted else reversed(moves):
@@ -425,7 +425,7 @@ def _keep_measured(desk: TuneDesk, target: Target, result: Any, title: str) -> l
 
 
 def verdicts(result: Any) -> tuple[AxisVerdict, ...]:
-    """Return the verdicts of a result on its axes, that of auto or of a stepper's commissioning."""
+    """Return the verdicts of a result on its axes, for auto and for a stepper's commissioning."""
     return tuple(
         AxisVerdict(
             k, axis.verdict, axis.reason, tuple(axis.reservations), tuple(getattr(axis, "notes", ())),
@@ -441,7 +441,7 @@ def _integers(gains: Any) -> tuple[int, ...]:
 
 
 def auto(store: bool, dynamics: str = DEFAULT) -> Callable[[Target, TunerSession, Callable[[str, float], None]], Any]:
-    """Return auto's work: that of `drive-tune auto`, its files in the run's folder."""
+    """Return the function that runs auto as `drive-tune auto` does, with its files in the run's folder."""
 
     def work(target: Target, run: TunerSession, progress: Callable[[str, float], None]) -> Any:
         from tuning.auto_to_files import auto_to_files, commission_to_files

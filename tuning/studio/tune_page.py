@@ -20,16 +20,16 @@ from tuning.studio.tune_panel import TunePanel, card, machine_card
 from tuning.studio.tuner_card import TunerCard
 
 REFRESH = 0.2  # s
-# On a narrow page but machine and gains begin folded: what is far below is found by its heading.
+# On a narrow page all cards except machine and gains begin folded: their headings are then visible.
 FOLD = """
 if (innerWidth <= 600)
   for (const one of [...document.querySelectorAll(".studio-fold")].slice(2)) one.open = false;
 """
-REREAD = 2.0  # s between two readings of the gains, which another page or another master may write
+REREAD = 2.0  # s between two readings of the gains, which another page or master may write
 
 
 def build(session: Session, visitor: Visitor) -> None:
-    """Make the page, or say why there is no tuning for these drives."""
+    """Build the page, or explain why these drives cannot be tuned."""
     if session.description.device is not None:
         TunePage(TunePanel(session, visitor)).build()
         return
@@ -45,7 +45,7 @@ class TunePage:
     """The controls of one page.
 
     Args:
-        panel: What its cards have in common.
+        panel: State and drives that its cards share.
     """
 
     def __init__(self, panel: TunePanel) -> None:
@@ -56,7 +56,7 @@ class TunePage:
         self._seen = -1
 
     def build(self) -> None:
-        """Make it."""
+        """Build the page."""
         ui.add_head_html('<link rel="stylesheet" href="/studio/assets/pages.css">')
         with ui.element("div").classes("studio-tune"):
             with ui.element("div").classes("studio-stack"):
@@ -75,7 +75,7 @@ class TunePage:
         ui.timer(REREAD, self._reread)
 
     def _gains_slide(self) -> None:
-        """Show what the sliders would make of the response."""
+        """Show the response with the gains of the sliders."""
         self.response.show(tuple(self.gains.wanted))
 
     def _show(self) -> None:
@@ -89,11 +89,11 @@ class TunePage:
         self.tuner.show()
 
     async def _reread(self) -> None:
-        """Read the gains again, unless something is under way."""
+        """Read the gains again, unless another job runs."""
         session, page = self.panel.session, self.panel.visitor.id
         if session.job is None and not session.waiting:
             future = session.do(tune_jobs.look(self.panel.desk), "Read the gains", page=page, quiet=True)
-            with contextlib.suppress(Exception):  # the next one may get through; what is wrong, other pages tell
+            with contextlib.suppress(Exception):  # the next reading may succeed; other pages show the error
                 await asyncio.wrap_future(future)
 
 

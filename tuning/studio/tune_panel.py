@@ -1,4 +1,4 @@
-"""What the cards of one page Tune have in common: its drives, its axis, its motor."""
+"""State and controls that the cards of one page Tune share: drives, axis, motor."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ def card(title: str, name: str) -> ui.element:
 
 
 class TunePanel:
-    """What the cards of one page get.
+    """The state that the cards of one page share.
 
     Args:
-        session: The drives, of a device that is known.
+        session: The drives, of a known device.
         visitor: The page.
 
     Attributes:
-        device: What they are.
-        desk: What all pages Tune know of them.
+        device: Device of the drives.
+        desk: State that all pages Tune share.
     """
 
     def __init__(self, session: Session, visitor: Visitor) -> None:
@@ -53,13 +53,13 @@ class TunePanel:
 
     @property
     def motor(self) -> Any:
-        """The motor that is turned, as far as it is known."""
+        """The motor: the emulated one, else the user's choice, else the device's usual one."""
         made = self.session.glimpse(lambda machine: machine.inside.motor)
         return made or find_motor(self.desk.entries.motor or self.device.default_motor)
 
     @property
     def supply(self) -> float:
-        """Supply voltage [V] that gains in SI are computed with."""
+        """Supply voltage for gains in SI units [V]."""
         given = self.desk.entries.supply
         return float(self.device.supply_of(self.motor)) if given is None else given
 
@@ -70,7 +70,7 @@ class TunePanel:
 
 
 def machine_card(panel: TunePanel) -> None:
-    """Make the card that asks what no bus tells: motor, travel, supply, coupling."""
+    """Build the card for data that cannot be read from a bus: motor, travel, supply, coupling."""
     desk = panel.desk
     emulated = desk.is_emulated
     with card("Machine", "machine"):
@@ -98,15 +98,15 @@ def machine_card(panel: TunePanel) -> None:
         )
 
     def choose(name: str) -> None:
-        """Take a motor, and show its supply where none was given."""
+        """Select a motor, and show its supply voltage if the user gave none."""
         _choose_motor(panel, name)
         if desk.entries.supply is None:
             supply.set_value(panel.supply)
-            desk.entries.supply = None  # it is shown, and was not given
+            desk.entries.supply = None  # the displayed value was not entered by the user
 
 
 def _choose_motor(panel: TunePanel, name: str) -> None:
-    """Take a motor of the catalogue, or the user's own by its file."""
+    """Select a motor of the catalogue, or the user's own by its file."""
     try:
         find_motor(name)
     except (ValueError, OSError) as error:

@@ -1,4 +1,4 @@
-"""The cards of tuners that do all by themselves: start, progress, trials as they come, verdict, certificate."""
+"""The cards of automatic tuners: start, progress, trials, verdict, certificate."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ if TYPE_CHECKING:
 
 Work = Callable[["Target", TunerSession, Callable[[str, float], None]], Any]
 
-# Of a verdict: the class of its colour, and a sign for who sees no colours.
+# For each verdict: CSS class, and a sign that needs no colour.
 LOOKS = {
     "accepted": ("is-accepted", "✓"),
     "accepted with reservations": ("is-reserved", "!"),
     "rejected": ("is-rejected", "✕"),
 }
-LINES = 12  # of what a run says that are shown
+LINES = 12  # messages of a run that are shown
 
 
 class TunerCard:
-    """What starts tuners, and what the present or last run says; parts of other packages get it.
+    """Starts tuners, and shows the present or last run; parts of other packages get it.
 
     Args:
         panel: The page.
@@ -44,7 +44,7 @@ class TunerCard:
         self._seen: tuple[Any, ...] = ()
 
     def build(self) -> None:
-        """Make it, and the parts that other packages add."""
+        """Build the card, and the parts of other packages."""
         panel = self.panel
         with card("Tune automatically", "tuner"):
             ui.label(
@@ -67,7 +67,7 @@ class TunerCard:
                 part.build(self)
 
     def build_run(self) -> None:
-        """Make the card that says what the run does and did."""
+        """Build the card of the present or last run."""
         with card("Run", "run"):
             self._head = ui.label("No run yet.").classes("studio-strong").props("role=status data-test=run-head")
             self._bar = ui.linear_progress(value=0.0, show_value=False).props('aria-label="Progress of the run"')
@@ -83,7 +83,7 @@ class TunerCard:
         await self.start(title, "auto", tune_jobs.auto(store, dynamics))
 
     async def start(self, title: str, kind: str, work: Work, columns: tuple[str, ...] = ()) -> None:
-        """Run a tuner: `kind` names its folder, `columns` are those of its trials."""
+        """Run a tuner; `kind` is part of its folder's name, `columns` are the titles of its trials."""
         panel = self.panel
         if panel.desk.run is not None and not panel.desk.run.is_over:
             panel.visitor.say(f"{panel.desk.run.title} is under way; stop it first", "warning")
@@ -99,7 +99,7 @@ class TunerCard:
         self.panel.session.end_job(f"{run.title} was stopped from a page")
 
     def show(self) -> None:
-        """Show how far the run is."""
+        """Show the progress of the run."""
         run = self.panel.desk.run
         if run is None:
             return
