@@ -59,7 +59,8 @@ def evaluate(
         str,
         typer.Argument(
             help="The policy: name of an agent that ships, agent.npz, checkpoint.zip, agent.onnx, module:function, or "
-            "a baseline (nothing, feed_forward, state_feedback, surrogate; of the suite rest, cascade, expert)."
+            "a baseline (nothing, feed_forward, state_feedback, surrogate; of the suite rest, cascade, expert, "
+            "nominal)."
         ),
     ],
     environment: Annotated[

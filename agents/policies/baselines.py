@@ -23,6 +23,7 @@ from agents.policies.experts import (
     Pendulum,
     SwingUp,
     TorqueCascade,
+    nominal,
 )
 from agents.tasks import environment_name
 from mechanics.arrays import Singles
@@ -144,16 +145,30 @@ BASELINES: dict[str, dict[str, Any]] = {
 
 # Task of the suite -> name of a baseline -> function that makes it. A baseline that cannot act has no row: a drive that
 # follows a profile cannot be held at rest by an offset, and no cascade balances a pole. In a tuning the cascade is that
-# of the commissioned drive.
+# of the commissioned drive. Where the expert is told the machine's parameters, `nominal` is the same one without them.
 SUITE_TASKS: dict[str, dict[str, Any]] = {
-    "ServoDrive/TorqueTracking-v1": {"rest": nothing, "cascade": TorqueCascade, "expert": ComputedTorque},
+    "ServoDrive/TorqueTracking-v1": {
+        "rest": nothing,
+        "cascade": TorqueCascade,
+        "expert": ComputedTorque,
+        "nominal": nominal(ComputedTorque),
+    },
     "ServoDrive/GantryBeam-v1": {"cascade": nothing, "expert": LeadAndFeedback},
-    "ServoDrive/Crane-v1": {"rest": nothing, "cascade": CarriageServo, "expert": Pendulum},
-    "ServoDrive/PoleBalance-v1": {"rest": nothing, "expert": Pendulum},
-    "ServoDrive/PoleSwingUp-v1": {"rest": nothing, "expert": SwingUp},
+    "ServoDrive/Crane-v1": {
+        "rest": nothing,
+        "cascade": CarriageServo,
+        "expert": Pendulum,
+        "nominal": nominal(Pendulum),
+    },
+    "ServoDrive/PoleBalance-v1": {"rest": nothing, "expert": Pendulum, "nominal": nominal(Pendulum)},
+    "ServoDrive/PoleSwingUp-v1": {"rest": nothing, "expert": SwingUp, "nominal": nominal(SwingUp)},
     "ServoDrive/ArmPath-v1": {"cascade": nothing, "expert": LeadAndFeedback},
     "ServoDrive/StepperRun-v1": {"rest": nothing, "expert": LoadAngle, "oracle": HighestSpeed},
-    "ServoDrive/PayloadScheduling-v1": {"cascade": nothing, "expert": PayloadSchedule},
+    "ServoDrive/PayloadScheduling-v1": {
+        "cascade": nothing,
+        "expert": PayloadSchedule,
+        "nominal": nominal(PayloadSchedule),
+    },
     "ServoDrive/KnownPayload-v1": {"cascade": nothing, "expert": PayloadSchedule},
     "ServoDrive/ServoTuning-v1": {"cascade": nothing, "expert": MarginDesign},
     "ServoDrive/AmplifierTuning-v1": {"cascade": nothing, "expert": MarginDesign},

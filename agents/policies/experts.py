@@ -70,6 +70,11 @@ class Expert:
         raise NotImplementedError
 
 
+def nominal(expert: type[Expert]) -> type[Expert]:
+    """Return a class of the expert that uses the nominal parameters on every machine, as it does on a bus."""
+    return type(f"Nominal{expert.__name__}", (expert,), {"told": lambda self, _parameters, mask: self.reset(mask)})
+
+
 class ComputedTorque(Expert):
     """Torque by the identified inertia and friction, with proportional and derivative feedback, of one axis in cst.
 

@@ -104,6 +104,20 @@ def test_the_cascade_scores_less_than_0_6_and_the_expert_0_7_to_0_95(name):
     assert max(scores.values()) < UNLEARNT + 0.02, scores
 
 
+@pytest.mark.parametrize("name", [name for name, rows in SUITE_TASKS.items() if "nominal" in rows])
+def test_a_nominal_expert_acts_as_the_expert_that_is_told_no_machine(name):
+    lanes = make_environments(name, 4)
+    seen, info = lanes.reset(seed=0)
+    told, untold = (baseline(row, name, lanes.config, 1) for row in ("expert", "expert"))
+    nominal = baseline("nominal", name, lanes.config, 1)
+    for one in (told, nominal):
+        one.told(info["parameters"], np.ones(4, bool))
+    seen = np.linspace(-0.1, 0.1, seen.size).reshape(seen.shape)  # near its balance a pole's regulator acts
+    lanes.close()
+    assert (nominal.act(seen) == untold.act(seen)).all()
+    assert (nominal.act(seen) != told.act(seen)).any()
+
+
 def test_an_agents_file_has_the_whole_configuration_of_its_task_and_another_is_refused():
     lanes = make_environments("Crane", 1)
     whole = configuration_of(lanes)
