@@ -243,7 +243,7 @@ class _Study:
 
 
 def _sampler(known: Any, seed: int) -> Any:
-    """Return Optuna's own sampler, which draws from the known trials instead of the study's present ones."""
+    """Return Optuna's TPE sampler for a round: it uses only the trials known at the round's begin, no later ones."""
     from optuna.samplers import TPESampler
 
     class FromTheRoundsBefore(TPESampler):  # type: ignore[misc]  # Optuna has no types

@@ -55,7 +55,7 @@ def environment_name(text: str) -> str:
 
 
 def row_of(environment: str) -> TrainingTask:
-    """Return the row of a configurable environment, or of the one that a task of the suite configures."""
+    """Return the row of ENVIRONMENTS for an environment; for a task of the suite, that of its environment."""
     return ENVIRONMENTS[environment_of(environment)]
 
 
@@ -92,14 +92,14 @@ def make_environments(
 
 
 def _is_of_task(value: Any, whole: Any) -> bool:
-    """Return whether an option equals the task's; weights of 0 may be missing, if newer than an agent's file."""
+    """Return whether an option equals the task's; an older agent's file may lack newer reward weights that are 0."""
     if isinstance(value, Mapping) and isinstance(whole, Mapping):
         return value == {key: one for key, one in whole.items() if key in value or one}
     return bool(value == whole)
 
 
 def without_machines(environment: str, configuration: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the options of an environment, or of a task of the suite, for given drives: without those of machines."""
+    """Return the options of an environment or task for given drives: those for drawn machines are left out."""
     own = SUITE[environment].options if environment in SUITE else {}
     return {key: value for key, value in {**own, **configuration}.items() if key not in OF_MACHINES}
 

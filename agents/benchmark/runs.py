@@ -45,7 +45,7 @@ class BenchmarkRun:
         kind: TRAINED, SUBMITTED or BASELINE.
         seed: Seed of the training.
         hyperparameters: Hyper-parameters of the training.
-        written: The policy to open if it is not trained.
+        written: The policy to be opened; None if the run trains its own.
         episodes: Number of held-out episodes.
     """
 
@@ -59,7 +59,7 @@ class BenchmarkRun:
 
     @property
     def folder(self) -> str:
-        """Its folder in the benchmark's folder."""
+        """Path of the run's folder within the benchmark's folder."""
         return f"{self.task.partition('/')[2]}/{self.policy}/{self.seed}"
 
     def check_same(self, path: Path, row: Row) -> None:
@@ -223,10 +223,10 @@ class RowCheck(NamedTuple):
 
 
 def check(path: Path, *, trust: bool = False) -> RowCheck:
-    """Run a row's episodes again with the policy beside it, and return whether it holds.
+    """Run a row's episodes again with its policy, a file in the same folder; return whether they confirm its scores.
 
     Raises:
-        RowError: If the file is no row, or was changed, or names a Python function without `trust`.
+        RowError: If the file is no row, was changed, lacks its policy, or names a Python function without `trust`.
         UntrustedError: For a checkpoint without `trust`.
     """
     from agents.benchmark.statistics import interquartile_mean

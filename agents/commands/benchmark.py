@@ -127,7 +127,7 @@ def _submission(context: typer.Context, tasks: list[str] | None, submit: str, tr
 
 
 def _check(context: typer.Context, path: Path, trust: bool) -> None:
-    """Say whether a row holds; exit code 1 if it does not."""
+    """Print whether running a row's episodes again confirms its scores; exit code 1 if it does not."""
     from agents.benchmark.runs import check
 
     others = ("--task", "--algorithm", "--seeds", "--steps", "--submit", "--out", "--resume", "--workers", "--cluster")
@@ -140,7 +140,7 @@ def _check(context: typer.Context, path: Path, trust: bool) -> None:
 
 
 def _check_alone(context: typer.Context, name: str, others: tuple[str, ...]) -> None:
-    """Raise ValueError for options that have no effect with another one."""
+    """Raise ValueError if the user gave one of the options `others`: with option `name` these have no effect."""
     given = [one for one in given_options(context) if one in others]
     if given:
         raise ValueError(f"{name} takes no {', '.join(given)}; leave it out")

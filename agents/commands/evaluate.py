@@ -225,7 +225,7 @@ def _typed(context: typer.Context, names: Iterable[str]) -> list[str]:
 
 
 def _check_numbers(episodes: int | None, gap: int | None, seed: int, limits: Mapping[str, float | None]) -> None:
-    """Raise ValueError for an impossible number; limits are times by their options' names."""
+    """Raise ValueError for an impossible number; `limits` maps an option's name to its time [s], None if not given."""
     for name, value in (("--episodes", episodes), ("--gap", gap), ("--seed", seed + 1)):
         if value is not None and value < 1:
             least = 0 if name == "--seed" else 1
@@ -236,7 +236,7 @@ def _check_numbers(episodes: int | None, gap: int | None, seed: int, limits: Map
 
 
 def _check_side(context: typer.Context, lockstep: bool, gap: int | None, replay: Path | None) -> None:
-    """Raise ValueError for options of the side, bus or emulator, on which the episodes do not run."""
+    """Raise ValueError for options that have no effect here: on a bus, on the emulator, with --gap or --replay."""
     on_bus = bool(_typed(context, BUS_OPTIONS))
     if not on_bus and gap is None:
         if lockstep:
@@ -309,7 +309,7 @@ def opened_for(
 
 
 def _against(run: _Run, against: str, found: Evaluation) -> list[str]:
-    """Return the gap between the results and the emulator's, or an earlier report's."""
+    """Return, as text, the gap between these results and those on the emulator or in an earlier report."""
     from agents.evaluation import gap
     from agents.evaluation.evaluation import Evaluation
 

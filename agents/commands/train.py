@@ -137,7 +137,7 @@ def with_load(
 
 @contextmanager
 def progress(title: str) -> Iterator[Report]:
-    """Show a training's progress, with speed and reward terms: a bar with a line below, or some lines in a file."""
+    """Show progress, speed and reward terms of a training: as a bar on a terminal, otherwise as a few printed lines."""
     from rich.console import Console, Group
     from rich.live import Live
     from rich.progress import (

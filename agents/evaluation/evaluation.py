@@ -113,7 +113,7 @@ class Evaluation:
 
 
 class _NoMachine(Observer):
-    """Hides the emulated machine."""
+    """Makes drives hide their emulated machine from their user."""
 
     hides_machine = True
 
@@ -211,7 +211,7 @@ def _how_to_act_on(on: GivenDrives) -> dict[str, Any]:
 
 
 def _guarded(policy: Any, lanes: Any, environment: str, on: GivenDrives | None) -> GuardedPolicy:
-    """Return the policy with its limits: those of given drives, and very wide ones for emulated machines."""
+    """Return the policy in a guard, with the limits for given drives or, on emulated machines, with very wide ones."""
     limits = PATIENT if on is None else on.guard or LIMITS[environment_of(environment)]
     space = lanes.single_action_space
     return GuardedPolicy(policy, space.low, space.high, STEP_SECONDS[environment_of(environment)](lanes.config), limits)

@@ -15,11 +15,11 @@ EMULATOR = "emulator"  # as a side: machines that are drawn for each episode
 
 
 class Gap(NamedTuple):
-    """A figure on two sides.
+    """A figure on two sides, such as emulator and bus.
 
-    first, second: The figure on the two sides.
-    difference: Second minus first, with its 95 % interval; paired by seed where both ran the same episodes.
-    paired: Whether they did.
+    first, second: The figure on the first and on the second side.
+    difference: Second minus first, with its 95 % interval; by pairs of equal seeds if `paired`.
+    paired: Whether both sides ran the same episodes on the same machines.
     medians: (low, value, high) of the quotient of the medians minus 1, second over first, with its 95 % interval; NaN
         if the first one is 0.
     """
@@ -33,10 +33,10 @@ class Gap(NamedTuple):
 
 
 def compare(first: Evaluation, second: Evaluation) -> list[Gap]:
-    """Return the gap of each figure that both have.
+    """Return the gap of each figure that both evaluations have.
 
     Raises:
-        ValueError: If they are of different environments.
+        ValueError: If the evaluations are of different environments.
     """
     if first.environment != second.environment:
         raise ValueError(f"{first.environment} and {second.environment} cannot be compared: they are different tasks")
@@ -79,7 +79,7 @@ def text(gaps: list[Gap], first: str, second: str) -> list[str]:
 
 
 def _medians(one: Floats, two: Floats, paired: bool) -> tuple[float, float, float]:
-    """Return the quotient of medians less 1 between the ends of its bootstrap interval."""
+    """Return (low, value, high) of the quotient of the medians minus 1; NaN without episodes or for a median of 0."""
     if paired:
         both = np.isfinite(one) & np.isfinite(two)
         one, two = one[both], two[both]
@@ -92,7 +92,7 @@ def _medians(one: Floats, two: Floats, paired: bool) -> tuple[float, float, floa
 
 
 def _excess_of_medians(one: Floats, two: Floats) -> Floats:
-    """Return the second median over the first less 1, of draws where the first is not 0."""
+    """Return the quotient of the medians minus 1, draw by draw; draws whose first median is 0 are left out."""
     medians, others = np.median(one, axis=1), np.median(two, axis=1)
     held = medians != 0.0
     return np.asarray(others[held] / medians[held] - 1.0)

@@ -116,12 +116,12 @@ def check_kept(found: Sensitivity, dynamics: Dynamics) -> None:
 def within(
     bundle: AgentFile, dynamics: Dynamics, told: Callable[[float], None] = lambda share: None
 ) -> tuple[AgentFile, Sensitivity]:
-    """Return an agent that answers following errors less, so that its loops keep the dynamics, and these loops.
+    """Return an agent that responds less to following errors, so that its loops keep the dynamics; and these loops.
 
-    Its lead over its set-points is unchanged. Its card has the reduction of its response.
+    Its feed-forward is unchanged. Its card states the reduction.
 
     Raises:
-        NotKeptError: If even the least of SHARES violates them.
+        NotKeptError: If the loops violate the dynamics even with the smallest of SHARES.
     """
     for k, share in enumerate(SHARES):
         agent = _answering(bundle, share)

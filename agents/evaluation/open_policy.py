@@ -156,7 +156,7 @@ class ModelPolicy:
         return action[0] if np.ndim(observation) == 1 else action
 
     def reset(self, mask: Any = None) -> None:
-        """Forget the episode."""
+        """Begin a new episode, in all environments or where the mask is true: clear a recurrent model's state."""
         if mask is None or self._begins is None:
             self._state = self._begins = None
         else:

@@ -88,12 +88,12 @@ def pole(episode: Episode, config: Any) -> float:
 
 
 def _told(name: str) -> Callable[[Episode, Any], float]:
-    """Return a figure of GainTuning's info at the end of an episode."""
+    """Return the function that reads an entry of GainTuning's info at an episode's end; NaN if it is missing."""
     return lambda episode, config: float(np.asarray(episode.last.get(name, np.nan)))
 
 
 def constraints_kept(episode: Episode, config: Any) -> float:
-    """Return 1 if the answer of GainTuning keeps the constraints, else 0; NaN on given drives, where it is unknown."""
+    """Return 1 if the answer of GainTuning keeps the constraints, else 0; NaN on given drives (machine unknown)."""
     cost = _told("robust_cost")(episode, config)
     return cost if np.isnan(cost) else float(cost < TRIP)
 

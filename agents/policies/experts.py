@@ -86,7 +86,7 @@ class ComputedTorque(Expert):
     LIMIT = 2.0  # of the motor's rated current: what the drive is commissioned with
 
     def actions(self, rows: Floats) -> Floats:
-        """Return the torque, of the current limit."""
+        """Return the torque as a share of that at the current limit."""
         motor, configuration = find_motor(self.configuration.motor), self.configuration
         amplitude, speed = (2.0 * np.pi * value for value in (configuration.amplitude, configuration.speed))
         constant = motor.torque_constant * self.parameter("motor.psi_m", motor.psi_m) / motor.psi_m
@@ -118,7 +118,7 @@ class Pendulum(Expert):
         self._gains: dict[float, Floats] = {}
 
     def actions(self, rows: Floats) -> Floats:
-        """Return the change of the cart's speed, of the greatest."""
+        """Return the change of the cart's speed as a share of the largest change."""
         configuration, lead = self.configuration, self._lead
         amplitude, speed = lead * configuration.amplitude, lead * configuration.speed
         greatest = 1.25 * configuration.ramp * speed  # m/s^2
@@ -159,7 +159,7 @@ class SwingUp(Pendulum):
     PUMP, CENTRE, BRAKE, MOST = 10.0, 10.0, 4.0, 0.8  # 1/m, 1/s^2, 1/s, of the greatest acceleration
 
     def actions(self, rows: Floats) -> Floats:
-        """Return the change of the cart's speed, of the greatest."""
+        """Return the change of the cart's speed as a share of the largest change."""
         configuration, lead = self.configuration, self._lead
         greatest = 1.25 * configuration.ramp * lead * configuration.speed
         length = self.parameter("load.length", configuration.task.length)
@@ -173,7 +173,7 @@ class SwingUp(Pendulum):
 
 
 class LeadAndFeedback(Expert):
-    """Set-points that lead by the cascade's lags, and by a share of the following error besides, of axes in csp.
+    """Set-points of axes in csp, advanced by the cascade's lags and by a multiple of the following error.
 
     Feed-forward of velocity and acceleration (Lambrechts et al. 2005); its two lags were found by trial, the same for
     every machine. The feedback is chosen so that Ms stays below 2.5 on all machines (`drive-agent margins expert`).
@@ -183,7 +183,7 @@ class LeadAndFeedback(Expert):
     FEEDBACK = 2.0  # lead per following error [rev/rev]
 
     def actions(self, rows: Floats) -> Floats:
-        """Return the lead of each axis' set-point, of the greatest."""
+        """Return the lead of each axis' set-point as a share of the largest lead."""
         configuration = self.configuration
         axes = rows[:, : rows.shape[1] // AXIS_ENTRIES * AXIS_ENTRIES].reshape(len(rows), -1, AXIS_ENTRIES)
         acceleration = configuration.speed * (axes[..., WANTED_SPEED_LATER] - axes[..., WANTED_SPEED]) / PREVIEW
@@ -195,8 +195,8 @@ class LeadAndFeedback(Expert):
 class PayloadSchedule(Expert):
     """Gains that are scheduled by the known payload (Astrom and Wittenmark, Adaptive Control, 1995, chapter 9).
 
-    They follow a rule as the baseline rule is (drive_env/devices/gains.py), whose constants are those of least lag
-    with soft dynamics, found by trying, the same for every machine.
+    The rule has the form of the baseline rule (drive_env/devices/gains.py). Its constants, found by trial and the same
+    for every machine, give the least lag with soft dynamics.
     """
 
     RULE = Rule(current_hz=1000.0, speed=0.226, integration=18.0, position=0.77)
@@ -227,7 +227,7 @@ class LoadAngle(Expert):
     GAIN = 1.0  # of the greatest change of the rate, of a full step
 
     def actions(self, rows: Floats) -> Floats:
-        """Return the change of the step rate, of the greatest."""
+        """Return the change of the step rate as a share of the largest change."""
         safe = self.LAG + self.LAG_OF_SPEED * self.configuration.speed * rows[:, SPEED]
         return np.asarray(self.GAIN * (safe - rows[:, TORQUE]))[:, None]
 
@@ -235,32 +235,32 @@ class LoadAngle(Expert):
 class HighestSpeed(Expert):
     """A step rate just below the highest that each machine's pull-out torque allows.
 
-    It must be told the machine, and refuses where none is known, on a bus.
+    The policy needs the true machine (`told`); without one, as on a bus, it raises ValueError.
     """
 
     SHARE, GAIN = 0.96, 3.0  # of the highest; of the greatest change of the rate, of `speed`
 
     def actions(self, rows: Floats) -> Floats:
-        """Return the change of the step rate, of the greatest."""
+        """Return the change of the step rate as a share of the largest change."""
         if not self._machine:
             raise ValueError("the oracle must be told the true machine, which no bus tells; take the expert")
         speed = self.SHARE * self._highest / (2.0 * np.pi * self.configuration.speed)
         return np.asarray(self.GAIN * (speed - rows[:, SPEED]))[:, None]
 
     def told(self, parameters: Mapping[str, Floats], mask: Any) -> None:
-        """Find the highest speeds of machines that begin."""
+        """Store the machines whose episode begins, and compute their highest speeds."""
         super().told(parameters, mask)
         device, motor = find_device(self.configuration.device), find_motor(self.configuration.motor)
         self._highest = highest_speeds(motor, amplitude(device, rated_setting(device, motor)), self._machine)
 
 
 class CarriageServo(Expert):
-    """The cascade of a carriage that knows nothing of its pendulum: position and speed follow, through acceleration."""
+    """A position and speed loop of the carriage, which commands its acceleration and ignores the pendulum."""
 
     BANDWIDTH = 10.0  # rad/s
 
     def actions(self, rows: Floats) -> Floats:
-        """Return the change of the carriage's speed, of the greatest."""
+        """Return the change of the carriage's speed as a share of the largest change."""
         configuration = self.configuration
         wanted = configuration.speed * (rows[:, WANTED_SPEED_LATER] - rows[:, WANTED_SPEED]) / PREVIEW
         wanted = wanted + self.BANDWIDTH**2 * configuration.amplitude * rows[:, ERROR]
@@ -274,17 +274,17 @@ class TorqueCascade(ComputedTorque):
     BANDWIDTH = 60.0
 
     def told(self, parameters: Mapping[str, Floats], mask: Any) -> None:
-        """Take no notice of the machine."""
+        """Ignore the machine's parameters."""
 
     def actions(self, rows: Floats) -> Floats:
-        """Return the torque, of the current limit."""
+        """Return the torque as a share of that at the current limit."""
         still = rows.copy()
         still[:, WANTED_SPEED] = still[:, WANTED_SPEED_LATER] = 0.0
         return super().actions(still)
 
 
 class MarginDesign(Expert):
-    """The fastest gains of a grid with which the machine's linear model keeps the margins, and its variants do.
+    """The fastest gains of a grid with which the linear models of the machine and of its variants keep the margins.
 
     As `drive-tune auto` designs (tuning/auto/design.py), without its trials on a model with friction and noise.
     """
@@ -303,17 +303,17 @@ class MarginDesign(Expert):
         self._design: Floats | None = None
 
     def reset(self, mask: Any = None) -> None:
-        """Forget the designs."""
+        """Delete the designed gains, so that the next episode designs its own."""
         self._design = None
 
     def actions(self, rows: Floats) -> Floats:
-        """Return the design's gains over the rule's, in steps, the same in each trial."""
+        """Return ln(designed gain / rule's gain) in steps of the action; the same in each trial."""
         if self._design is None:
             self._design = self._designed(rows)
         return np.asarray(self._design / self.configuration.step)
 
     def _designed(self, rows: Floats) -> Floats:
-        """Return ln of the gains over the rule's, (environments, 3)."""
+        """Design gains; return ln(designed gain / rule's gain), (environments, 3)."""
         from drive_env.trials.method import new_score
 
         c, count = self.configuration, len(rows)

@@ -16,7 +16,7 @@ FIRST = ("rollout/ep_rew_mean", "rollout/return", "eval/mean_reward", "return")
 
 
 def first_tag(tags: list[str]) -> str | None:
-    """Return the tag of the curve shown first: a return if there is one, else the first tag, None without tags."""
+    """Return the tag of the curve shown first: an episode's return if there is one, else the first; None without."""
     return next((tag for tag in FIRST if tag in tags), tags[0] if tags else None)
 
 

@@ -39,10 +39,12 @@ class _Split(nn.Module):  # type: ignore[misc]
 
 
 class AsymmetricPolicy(MultiInputActorCriticPolicy):  # type: ignore[misc]
-    """PPO's policy with such a critic: `policy: agents.training.asymmetric:AsymmetricPolicy` in the YAML.
+    """PPO's policy whose critic sees more than the actor.
+
+    In the YAML: `policy: agents.training.asymmetric:AsymmetricPolicy`.
 
     Raises:
-        ValueError: For an observation without the two entries.
+        ValueError: For an observation that is not a dict of the actor's entry and at least one more.
     """
 
     def __init__(self, observation_space: Any, *rest: Any, **options: Any) -> None:

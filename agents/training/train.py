@@ -207,7 +207,7 @@ def bundle_of_checkpoint(path: str | Path, *, trust: bool = False) -> AgentFile:
 
 
 def _run_of(table: Mapping[str, Any], path: Path) -> TrainingRun:
-    """Return the run that a checkpoint tells of, with the files of its user that its folder has."""
+    """Return the run that a checkpoint describes, with the user's files that are stored in its folder."""
     try:
         return TrainingRun(**found_again(table["run"], table.get("inputs"), path.parent, alone=True))
     except TypeError as error:
@@ -263,7 +263,7 @@ def make_model(run: TrainingRun, env: Any) -> tuple[Any, Any]:
 
 
 def is_sound(model: Any) -> bool:
-    """Return whether all weights of a model are numbers, and the deviation of its actions is one above 0."""
+    """Return whether a model's weights are finite, and its actions' standard deviation, if any, is above 0."""
     weights = list(model.policy.parameters())
     if getattr(model.policy, "log_std", None) is not None:
         deviation = model.policy.log_std.exp()
@@ -272,14 +272,14 @@ def is_sound(model: Any) -> bool:
 
 
 def _count_from(env: Any, steps: int) -> None:
-    """Have the curriculum's steps be those of the run: neither an imitation's nor those since it was resumed."""
+    """Set the curriculum's step count to the run's: without an imitation's steps, with those before a resumption."""
     while hasattr(env, "venv"):
         env = env.venv
     env._steps = steps
 
 
 def _imitate(run: TrainingRun, model: Any, lanes: CountedEnvironments, report: Report | None) -> None:
-    """Have the model begin as the baseline that the hyper-parameters name."""
+    """Teach the model, before PPO begins, the actions of the baseline that the hyper-parameters name."""
     from agents.policies.baselines import baseline
     from agents.training.imitation import imitate
 
@@ -302,7 +302,7 @@ def _imitate(run: TrainingRun, model: Any, lanes: CountedEnvironments, report: R
 
 @contextmanager
 def _settings_of(name: str) -> Iterator[None]:
-    """Report arguments that a constructor does not take as a mistake in the hyper-parameters: SB3 asserts some."""
+    """Raise HyperparameterError if a constructor in the block rejects its arguments: SB3 checks some by assertions."""
     try:
         yield
     except (TypeError, AssertionError) as error:
@@ -323,7 +323,7 @@ def found(name: str) -> Any:
     """Import the object of "module:name".
 
     Raises:
-        HyperparameterError: If there is no such thing.
+        HyperparameterError: If there is no such object.
     """
     module, _, kind = str(name).partition(":")
     try:

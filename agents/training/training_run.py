@@ -54,9 +54,10 @@ class TrainingRun:
 
 
 class Progress(NamedTuple):
-    """The progress of a training: means of the last episodes and of each term per step; speed [steps/s]; time's shares.
+    """The progress of a training: means of the last episodes, mean of each reward term per step, speed [steps/s].
 
-    `imitated` is the finished share of a preceding imitation: all else is 0 until it is 1.
+    `environment_share` is the environment's share of the time. `imitated` is the finished share of a preceding
+    imitation; until it is 1, all other fields but `total` are 0.
     """
 
     timesteps: int

@@ -23,10 +23,10 @@ NEAREST = LOWERED[np.abs(np.log(LOWERED)).sum(axis=1).argsort(kind="stable")]
 
 
 class KeptMargins(NamedTuple):
-    """The loops of identified machines with any gains.
+    """Checks any gains against the required dynamics, by the loops of the identified machines.
 
-    models: Loops of each machine, and its axes. dynamics: The required dynamics. calm: Gains to use if no lowered ones
-    keep them, raw, (num_axes, count).
+    models: Loops of each machine, and its axes. dynamics: The required dynamics. calm: Slow gains, raw, (num_axes,
+    count), for machines on which no lowered gains keep the dynamics.
     """
 
     models: list[tuple[LoopModel, Integers]]

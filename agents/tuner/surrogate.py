@@ -169,7 +169,7 @@ class SurrogatePolicy:
         self._forget(0)
 
     def reset(self, mask: Mask | None = None) -> None:
-        """Forget the machines, all or those of a mask over the environments."""
+        """Delete what was stored about the machines, of all environments or where the mask is true."""
         if mask is None or not len(self._known):
             self._forget(0)
         else:
@@ -191,10 +191,10 @@ class SurrogatePolicy:
         return self._leave(chosen - incumbent, observation)
 
     def answer(self, observation: ArrayLike) -> Floats:
-        """Return the change of the log gains to the final choice, in steps: to a trial's gains, or the rule's.
+        """Return the final choice as an action: the change, in steps, from the incumbent's log gains to a trial's.
 
-        All axes of an environment get the same trial: the one not stopped whose worst axis is best. Call it instead of
-        `act`, with the observation after the last trial; it raises the same errors.
+        All axes of an environment get the gains of the same trial: of those not stopped, including the rule's, the one
+        whose worst axis is best. Called instead of `act` after the last trial, with the same errors.
         """
         _, incumbent = self._take(observation)
         median, scale = self._ask(self._read(), self._tried)
@@ -257,7 +257,7 @@ class SurrogatePolicy:
         return medians.mean(axis=0), scales.mean(axis=0) + medians.std(axis=0)
 
     def _least(self, memory: list[Memory], candidates: Singles) -> Singles:
-        """Return the candidate to try of every machine, (machines, gains)."""
+        """Return for every machine the candidate to try next, (machines, gains)."""
         median, scale = self._ask(memory, candidates)
         return _pick(candidates, median - self._curiosity * scale)
 
@@ -274,5 +274,5 @@ class SurrogatePolicy:
 
 
 def _pick(gains: Singles, value: Singles) -> Singles:
-    """Return the gains with the least value of every machine, (machines, gains)."""
+    """Return for every machine, of its candidate gains, those with the least value, (machines, gains)."""
     return np.asarray(gains[np.arange(len(gains)), value.argmin(axis=1)], np.float32)

@@ -58,11 +58,11 @@ class TrialShown(NamedTuple):
 
 
 class Tuned(NamedTuple):
-    """The result: the answer's gains, raw (num_axes, count), all trials, and each machine's answer among them.
+    """The result: final gains, raw (num_axes, count), all trials, and the number of each machine's final trial.
 
-    The answer is the policy's own choice (`answer`) where it makes one that was not stopped and keeps the margins, else
-    the best such trial by measured terms; of a machine without any it is the first one, the baseline rule's.
-    overruled: Machines whose policy would have stayed with other gains.
+    The final trial is the one that the policy chooses (`answer`), if it was not stopped and its gains keep the margins;
+    otherwise the best such trial by measured terms; without any such trial it is trial 0, the baseline rule's.
+    overruled: Machines that got other gains than the policy chose.
     """
 
     gains: Integers

@@ -34,7 +34,7 @@ def method_of(
 
 
 def finder(policy: Any, doubts: Sequence[str], show: Callable[[TrialShown], None], say: Callable[[str], None]) -> Find:
-    """Return the search of a run of auto, by a policy's trials; arguments as for `method_of`."""
+    """Return the function that finds gains in a run of auto, by a policy's trials; arguments as for `method_of`."""
 
     def find(bench: AutoBench, basis: Basis, _: Any) -> RecordedGains:
         for doubt in doubts:
