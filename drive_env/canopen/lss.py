@@ -65,13 +65,13 @@ class LssNode(Protocol):
     """The calls of the slave to its node."""
 
     def identity(self) -> LssIdentity:
-        """Return its identity."""
+        """Return the node's identity."""
 
     def active_node_id(self) -> int:
-        """Return its present node-ID; 255 if it has none."""
+        """Return the present node-ID; 255 if the node has none."""
 
     def pending_node_id(self) -> int:
-        """Return its node-ID after the next reset."""
+        """Return the node-ID after the next reset."""
 
     def configure_node_id(self, node_id: int) -> None:
         """Store a pending node-ID for the next reset."""

@@ -334,7 +334,7 @@ class Node:
         self._store.loses_power = value
 
     def leds(self, error_counter: int = 0) -> Leds:
-        """Return its LEDs; `error_counter` is its controller's."""
+        """Return the state of the node's LEDs; `error_counter` is that of its CAN controller."""
         boots = self.state is NmtState.INITIALISING
         is_lss = self.node_id == UNCONFIGURED or (self._lss is not None and self._lss.is_configuring)
         return leds_of(self.state, not self._is_online and not boots, self._errors.conditions, error_counter, is_lss)
@@ -749,11 +749,11 @@ class Node:
         return LssIdentity(*(part if isinstance(part, int) else 0 for part in parts))
 
     def active_node_id(self) -> int:
-        """Return its node-ID; 255 if it has none."""
+        """Return the node-ID; 255 if the node has none."""
         return self.node_id
 
     def pending_node_id(self) -> int:
-        """Return its node-ID after the next reset."""
+        """Return the node-ID after the next reset."""
         return self.node_id if self._pending_node_id is None else self._pending_node_id
 
     def configure_node_id(self, node_id: int) -> None:

@@ -186,7 +186,7 @@ def replay(
 def _check_frames(file: Path, frames: list[Any], speed: float) -> None:
     """Raise ValueError for frames that classic CAN does not have, and for waits between stamps that are too long.
 
-    A log goes a little back where two buses were.
+    In a log of two buses the stamps may go back a little.
     """
     for number, frame in enumerate(frames, 1):
         size = max(len(frame.data), frame.dlc)
@@ -250,9 +250,9 @@ def _in_time(port: Any, frames: list[Any], speed: float, noted: list[int]) -> It
 
 
 def _take_interrupts() -> Any:
-    """Let SIGINT end a log also where it is ignored, and return the handler before, None where nothing was changed.
+    """Let SIGINT end a log also where it is ignored; return the previous handler, None if nothing was changed.
 
-    A script's shell starts what is in its background so (POSIX), and such a log would have no end.
+    A shell script starts its background commands with SIGINT ignored (POSIX): a log there would never end.
     """
     if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
         return None

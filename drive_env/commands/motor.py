@@ -206,7 +206,7 @@ def _write(file: Path, data: Mapping[str, object], printed: Mapping[str, str]) -
 
 
 def _tell(file: Path, row: Motor) -> None:
-    """Print figures derived from the numbers, which reveal wrong ones."""
+    """Print figures derived from a motor's numbers, by which the user may notice a wrong number."""
     from drive_env.devices import device_names, find_device
     from drive_env.firmware import motor_kinds
     from drive_env.motors import is_extra_low

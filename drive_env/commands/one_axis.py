@@ -88,14 +88,14 @@ class OneAxis:
 
     Args:
         drives: Drives of one node, with the envelope.
-        axis: Its number.
+        axis: Number of the axis to move.
 
     Attributes:
-        mode: Its mode for turning at a speed.
-        target: The object of that speed.
-        has_position: Whether its drive shows a position.
+        mode: The mode in which the axis turns at a speed.
+        target: The object of that mode's target speed.
+        has_position: Whether the drive shows a position.
         speed: The object that shows the speed.
-        turned: The speed before it was brought to rest, of a drive without a position; 0 of others.
+        turned: Of a drive without a position, the speed just before the axis was brought to rest; of others 0.
     """
 
     def __init__(self, drives: BusDrives, axis: int) -> None:
@@ -115,19 +115,19 @@ class OneAxis:
         self.scale: Scale = scales_of(drives)[axis]
 
     def position(self) -> int:
-        """Return where it is [inc], 0 of a drive without a position."""
+        """Return the axis' position [inc]; 0 if the drive shows none."""
         return self.read(cia402.POSITION_ACTUAL) if self.has_position else 0
 
     def read(self, name: ObjectName) -> int:
-        """Return an object of it."""
+        """Return an object's value on the axis."""
         return int(self.drives.read(name)[self.axis])
 
     def write(self, name: int, raw: int) -> None:
-        """Write an object of it."""
+        """Write an object on the axis."""
         self.drives.write(name, raw, where=self.where)
 
     def parse(self, text: str, name: ObjectName) -> int:
-        """Return the integer of an object of it that a text means; ValueError if it means none, or one out of range."""
+        """Convert a text to an object's integer; ValueError for an invalid text or a value out of range."""
         from drive_env.dictionary import quantities
         from drive_env.dictionary.access import check_limits
 

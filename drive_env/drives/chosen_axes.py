@@ -53,11 +53,11 @@ class ChosenAxes(DrivesProxy):
     """Chosen axes of drives, with the interface of drives.
 
     Args:
-        drives: The drives; they are closed with these.
+        drives: The drives, which are closed when the chosen axes are.
         axes: Numbers of the chosen axes, ascending.
 
     Raises:
-        ValueError: For an axis that they do not have.
+        ValueError: For an axis that the drives do not have.
     """
 
     def __init__(self, drives: Drives, axes: Sequence[int]) -> None:

@@ -1,4 +1,4 @@
-"""Faults of emulated machines: begun and ended by their schedule, in addition to the machines' parameters."""
+"""Faults of emulated machines: they begin and end by their schedule, and change the machines' parameters meanwhile."""
 
 from __future__ import annotations
 
@@ -261,7 +261,7 @@ class MachineFaults:
 
     # --- inside ---------------------------------------------------------------------------------------------------
     def _made(self, number: int, order: Order, axes: Mask, *changing: Integers) -> _MachineFault:
-        """Return a fault by its order, with its axes, and its state, begin and end in each machine."""
+        """Return the fault of an order on some axes; `changing`: state, begin, end per machine, default: not begun."""
         row, changes = self.check(order)
         delay, length = cycles_of(order, row, self._inside.cycles)
         given, condition = checked_parameters(row, order.parameters), Condition.parse(order.when)

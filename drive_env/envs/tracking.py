@@ -439,7 +439,7 @@ class Tracking(VectorEnvironment):
         return scales
 
     def _profile_scales(self) -> Floats:
-        """Return raw units of the target per unit of the reference's row: 1, in cst counts of torque per inc/s^2."""
+        """Return raw units of the target per raw unit of the reference: in cst counts of torque per inc/s^2, else 1."""
         config, drives = self.config, self.drives
         if config.mode != "cst":
             return np.ones(drives.num_axes)

@@ -67,11 +67,11 @@ class Synchronisation:
         self._is_new = False
 
     def owns(self, entry: Entry) -> bool:
-        """Return whether an object is one of these."""
+        """Return whether an object is one of the synchronisation's."""
         return (entry.index, entry.sub) in self._values
 
     def port(self, entry: Entry) -> ObjectPort:
-        """Return the port of one of them."""
+        """Return the port of one of the synchronisation's objects."""
         key = (entry.index, entry.sub)
 
         def read() -> int:

@@ -217,10 +217,10 @@ class MasterWatch(Protocol):
         """Return whether a node's watchdog was set and not yet restored."""
 
     def is_in_force(self, node: int) -> bool:
-        """Return whether a node, asked, still watches over this master.
+        """Ask a node whether it still watches over this master, and return its answer.
 
         Raises:
-            BusError: If it does not answer.
+            BusError: If the node does not answer.
         """
 
     def holds(self, key: Key) -> bool:

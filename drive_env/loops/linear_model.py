@@ -211,7 +211,7 @@ def outer_loop(device: Device, plant: Plant, gains: RawGains, f: ArrayLike, velo
 
     Args:
         device: The drive.
-        plant: The axis; used is its velocity filter, which is not in the position loop.
+        plant: The axis; its velocity filter is divided out of the velocity loop, since positions do not pass it.
         gains: Raw integers in the order of the device's gain set.
         f: Frequencies [Hz], shape (n,).
         velocity: Open loop of the velocity loop there, shape (n,).
@@ -251,7 +251,7 @@ def controllers(device: Device, gains: RawGains) -> Controllers:
 
 
 def velocity_filter_response(device: Device, plant: Plant, f: ArrayLike) -> Complex:
-    """Return the velocity filter, and the axis' delay beyond the loop's own period, at frequencies [Hz]."""
+    """Return the response, at frequencies [Hz], of velocity filter and of the axis' delay beyond one loop period."""
     from drive_env.emulator.parameters import velocity_filter
 
     at = np.asarray(f, float)

@@ -101,7 +101,7 @@ def _unseen(known: Integers, log_gain: Floats) -> Integers:
 
 
 def _crossings(f: Floats, value: Floats, where: Mask) -> Floats:
-    """Return where a value passes 0 in the chosen intervals, along a straight line over log f."""
+    """Return the frequencies at which a value passes 0 in the chosen intervals, by a straight line over log f."""
     k = np.flatnonzero(where)
     share = value[k] / (value[k] - value[k + 1])
     return np.asarray(np.exp(np.log(f[k]) + share * np.log(f[k + 1] / f[k])))

@@ -217,7 +217,7 @@ def mean_velocity(rates: LoopRates, one: LoopWindow, f: Floats) -> Complex:
 
     Args:
         rates: The drive's rates.
-        one: The window.
+        one: Result of `window` for the machines.
         f: Frequencies [Hz], (machines, n).
     """
     z = np.exp(2j * math.pi * f / rates.velocity_rate)

@@ -83,10 +83,10 @@ class ChangedObjects:
             self.change(self._description.key(entry, part), _QUICK_STOP, only_from=_NO_ACTION)
 
     def are_in_force(self) -> bool:
-        """Return whether the node, asked, still has the values that were set.
+        """Read the objects; return whether the node still has the values that were set.
 
         Raises:
-            BusError: If it does not answer.
+            BusError: If the node does not answer.
         """
         return all(self.read(key)[: len(data)] == data for key, data in self._set.items())
 

@@ -105,7 +105,7 @@ class LockstepPace:
         self.timing = self.total = Timing(0, 0, 0.0)
 
     def begin(self) -> None:
-        """Begin."""
+        """Begin a run of cycles."""
         self.timing = Timing(0, 0, 0.0)
 
     def wait(self, receive: Receive) -> int:

@@ -99,7 +99,7 @@ def read_parameters(
 
 
 def compare(drives: DescribedAxes, wanted: Mapping[Key, int], axis: int = 0) -> list[Difference]:
-    """Return where an axis differs from wanted values."""
+    """Return the parameters in which an axis differs from wanted values."""
     differences = []
     for key, value in wanted.items():
         entry = drives.description.dictionary.find(key)

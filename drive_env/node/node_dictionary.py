@@ -23,10 +23,10 @@ class OwnObjects(Protocol):
     commands: dict[tuple[int, int], Callable[[int], None]]
 
     def owns(self, entry: Entry) -> bool:
-        """Return whether an object is one of them."""
+        """Return whether an object is one of the node's own."""
 
     def port(self, entry: Entry) -> ObjectPort:
-        """Return the port of one of them."""
+        """Return the port of one of the node's own objects."""
 
 
 class NodeDictionary:

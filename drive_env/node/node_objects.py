@@ -82,7 +82,7 @@ class NodeObjects:
         return raw
 
     def port(self, entry: Entry) -> ObjectPort:
-        """Return the port of one of these objects."""
+        """Return the port of one of the node's own objects."""
         key = (entry.index, entry.sub)
         values = self._values
         read: Callable[[], int | str] = self.readers.get(key) or (lambda: values[key])

@@ -119,7 +119,7 @@ class ImageObjects:
         return (entry.index, entry.sub) in self._values
 
     def port(self, entry: Entry) -> ObjectPort:
-        """Return the port of one of them."""
+        """Return the port of one of the image's objects."""
         key = (entry.index, entry.sub)
 
         def write(raw: int) -> None:

@@ -34,22 +34,22 @@ TARGETS = {
 TO_SI = {"pp": 2.0 * math.pi, "pv": math.pi / 30.0, "csv": math.pi / 30.0, "cst": 1.0}
 UNITS = {"pp": "turns", "pv": "rpm", "csv": "rpm", "cst": "A"}
 PROFILE_VELOCITY = (cia402.PROFILE_VELOCITY, 0)
-# What is chosen, as shares of what there is: enough to be seen, and no limit is reached.
+# Chosen shares of travel, speed, current and torque: large enough to be seen, and no limit is reached.
 TRAVEL_SHARE, SPEED_SHARE, CURRENT_SHARE, LOAD_SHARE = 0.8, 0.5, 0.2, 0.3
 LONGEST_MOVE = 1.0  # s at profile velocity
 HINGE, HINGE_OF_MANY, SLIDE = 2.0 * math.pi, math.pi / 4.0, 0.3  # moves where nothing limits them [rad, rad, m]
 MAX_TIME, MAX_PIXELS = 60.0, 4096
-LOOK = 0.05  # s before anything moves, and 0.2 s of what follows a fault
-AFTER_FAULT = 0.2
+LOOK = 0.05  # s of the film before anything moves
+AFTER_FAULT = 0.2  # s of the film after a fault
 
 
 class DemonstrationError(ValueError):
-    """A run that cannot be: one line with key, value, limit and remedy."""
+    """An impossible run; the message is one line with key, value, limit and remedy."""
 
 
 @dataclass(frozen=True)
 class PictureFormat:
-    """Size [pixels] and pace of the film; `slow` seconds of film show one second of run, None chooses."""
+    """Size [pixels] and pace of the film; `slow` seconds of film show one second of run; None: by its duration."""
 
     width: int = 960
     height: int = 540
@@ -59,7 +59,7 @@ class PictureFormat:
 
 @dataclass(frozen=True)
 class Demonstration:
-    """A run: see demonstration.toml for units; None is chosen to suit load and motor."""
+    """The run of a film, in the units of demonstration.toml; for None a value is chosen that suits load and motor."""
 
     device: str = DEFAULT_DEVICE
     motor: str = "qbl4208"
@@ -80,10 +80,10 @@ def load_demonstration(config: str | Path | None = None, **overrides: Any) -> De
 
     Args:
         config: The file.
-        overrides: device, motor, load, seed, or the picture's slow, in place of the file's; None keeps the file's.
+        overrides: Values of device, motor, load, seed or the picture's `slow` instead of the file's; None: the file's.
 
     Raises:
-        DemonstrationError: With the key, its value, the limit and the remedy.
+        DemonstrationError: If the file cannot be read, or a value is impossible.
     """
     path = DEFAULT if config is None else Path(config)
     try:

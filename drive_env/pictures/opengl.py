@@ -1,6 +1,6 @@
-"""Which OpenGL draws off-screen: MUJOCO_GL if it is set, EGL where there is no display, else the system's own.
+"""Chooses the OpenGL library for drawing: that of MUJOCO_GL if set, EGL without a display, else the system's own.
 
-MuJoCo picks its library when it is imported and fails there in many ways; here every way ends in one line.
+MuJoCo chooses its library when it is imported, and fails there in many ways; here each failure is an error of one line.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _PACKAGES = "EGL needs a driver with libEGL (Debian: libegl1), OSMesa the packag
 
 
 class OpenGLError(RuntimeError):
-    """No picture can be drawn: one line with the reason and the remedy."""
+    """No picture can be drawn; the message is one line with the reason and the remedy."""
 
 
 def has_display() -> bool:
@@ -35,8 +35,7 @@ def choose_library() -> str:
     """Return the name of the OpenGL library to draw with, as in MUJOCO_GL.
 
     Raises:
-        OpenGLError: If MUJOCO_GL names none of this system, switches drawing off, or asks for a display that is not
-            there.
+        OpenGLError: If MUJOCO_GL names no library of this system, switches drawing off, or needs a missing display.
     """
     system = "linux" if sys.platform.startswith("linux") else sys.platform
     known = _LIBRARIES.get(system, _LIBRARIES["linux"])
@@ -55,7 +54,7 @@ def choose_library() -> str:
 
 
 def import_mujoco() -> Any:
-    """Return the module `mujoco`, imported for the OpenGL that is there.
+    """Import `mujoco` with the chosen OpenGL library, and return it.
 
     Raises:
         OpenGLError: As choose_library, and if the library is not installed.

@@ -23,11 +23,11 @@ PALETTE_COLORS = 256
 
 
 class PictureFileError(ValueError):
-    """A film that cannot be written: one line with the reason and the remedy."""
+    """A film cannot be written; the message is one line with the reason and the remedy."""
 
 
 def check_out(path: str | Path) -> Path:
-    """Return where a film goes, once it is clear that it can be written there.
+    """Return the path of a film, after checking that it can be written.
 
     Raises:
         PictureFileError: If the ending is unknown, ffmpeg is missing, or the folder is not empty or does not exist.
@@ -60,7 +60,7 @@ def check_out(path: str | Path) -> Path:
 def write_film(out: str | Path, frames: Iterable[Image], frame_time: float) -> None:
     """Write frames, uint8 of shape (height, width, 3), each shown for `frame_time` [s].
 
-    A film appears under its name when it is complete; what is broken off leaves nothing.
+    The film gets its name when it is complete; an interrupted one leaves no file.
 
     Raises:
         PictureFileError: As check_out, and if ffmpeg fails.

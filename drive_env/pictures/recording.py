@@ -1,6 +1,6 @@
-"""A run as a film needs it: where the machine was and what its drives measured, every communication cycle.
+"""The recording of a run for a film: the machine's positions and its drives' signals in every communication cycle.
 
-`Recorder` stands in for the drives, so that `motion` and any script drive through it unchanged.
+A `Recorder` is used like the drives: `motion` and scripts work with it unchanged.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ class Recorder:
         self.drives.write(name, value, where)
 
     def advance(self, duration: float) -> None:
-        """Let time pass [s], whole communication cycles of 1 ms, and remember each."""
+        """Let time pass [s] and record each communication cycle of 1 ms; ValueError for a part of a cycle."""
         cycles = round(duration / CYCLE)
         if cycles < 0 or abs(cycles * CYCLE - duration) > 1e-9:
             raise ValueError(
@@ -115,11 +115,11 @@ class Recorder:
             self._wanted.append(np.full((2, self._axes.stop - self._axes.start), np.nan))
 
     def look(self, wanted: tuple[Floats, Floats] | None = None) -> None:
-        """Remember how things stand now, once per period, while someone else lets time pass.
+        """Record the present state; to be called once per period by the code that lets time pass.
 
         Args:
-            wanted: What a master follows that sends the drives something else: position [inc] and velocity [60FFh],
-                (num_axes,) each.
+            wanted: Set-points of a controller in the master, which sends the drives other values: position [inc] and
+                velocity [60FFh], (num_axes,) each. None: without such a controller.
         """
         none = np.full(self.num_axes, np.nan)
         self._wanted.append(np.stack([part[self._axes] for part in (wanted or (none, none))]))

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 Progress = Callable[[float], None]
 
-FILM_LENGTH = 8.0  # s, about what one watches
+FILM_LENGTH = 8.0  # s, which the slow-motion factor approaches
 PACES = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
 HEADER, FOOTER, EDGE = 34, 26, 14  # pixels of a frame of NORMAL size; others are scaled
 NORMAL = (960, 540)
@@ -42,7 +42,7 @@ VIEWER_FRAME = 1.0 / 60.0  # s
 def pace(duration: float, picture: PictureFormat) -> tuple[float, int]:
     """Return the slow-motion factor of a run [s], and the communication cycles between two frames.
 
-    A frame shows whole communication cycles, so the factor is exact and the frame rate gives way.
+    A frame shows whole communication cycles: the factor is exact, and the frame rate is adapted to it.
     """
     slow = picture.slow
     if slow is None:
@@ -95,12 +95,12 @@ class Picture:
     def frame(self, recording: Recording, k: int = -1, slow: float | None = None) -> Image:
         """Return the frame of sample k of a recording, uint8 of shape (height, width, 3).
 
-        The traces of one recording are drawn once, so frames that follow cost the machine's picture alone.
+        The traces of a recording are drawn once: for its later frames only the machine is drawn.
 
         Args:
             recording: The run so far.
             k: Number of the sample; the last by default.
-            slow: Slow-motion factor to tell; None tells none.
+            slow: Slow-motion factor to be written in the frame; None: no factor is written.
         """
         width, height = self._size
         layout = self._layout
@@ -114,7 +114,7 @@ class Picture:
         return _with_text(frame, layout, recording, t, slow, self.scene.grid)
 
     def close(self) -> None:
-        """Give the OpenGL context back."""
+        """Release the OpenGL context."""
         self.scene.close()
 
     def __enter__(self) -> Picture:

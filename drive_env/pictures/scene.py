@@ -109,7 +109,7 @@ class Scene:
         return np.ascontiguousarray(image[::-1])  # OpenGL counts rows from below
 
     def close(self) -> None:
-        """Give the OpenGL context back."""
+        """Release the OpenGL context."""
         if self._context is not None:
             self._context.make_current()
             self._renderer.free()

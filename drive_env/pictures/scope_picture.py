@@ -1,7 +1,7 @@
-"""The scope beside the machine: position, velocity and current of a recording, drawn once and uncovered by columns.
+"""The scope beside the machine: position, velocity and current of a recording, drawn once and shown up to a time.
 
-Drawing with matplotlib takes a tenth of a second; uncovering the finished picture up to a time takes less than one
-thousandth of it, so a film costs one drawing.
+Drawing with matplotlib takes a tenth of a second; copying the columns of the finished picture up to a time takes less
+than a thousandth of that, so that a film needs one drawing only.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ RPM = 30.0 / math.pi
 
 
 class Panel(NamedTuple):
-    """One set of axes: its title, its unit, demand and actual in that unit, each of shape (n, A)."""
+    """One diagram of the scope: title, unit, demand and actual values in that unit, each of shape (n, A)."""
 
     name: str
     unit: str
@@ -62,7 +62,7 @@ def panels(recording: Recording) -> list[Panel]:
 
 
 class ScopePicture:
-    """The finished scope of a recording and the empty one, to be shown up to any time.
+    """The scope of a recording, drawn once with all traces and once without: `until` combines both at a time.
 
     Args:
         recording: The run.
@@ -134,7 +134,7 @@ def _draw_panel(axes: Axes, t: Floats, panel: Panel, shown: int) -> list[Line2D]
 
 
 def _shade_load(axes: Axes, recording: Recording) -> list[Artist]:
-    """Shade the times in which the load pushes."""
+    """Shade the times with a load torque."""
     pushes = np.diff((recording.load_torque != 0.0).astype(int), prepend=0, append=0)
     times = np.append(recording.t, recording.t[-1])
     starts, ends = times[np.flatnonzero(pushes > 0)], times[np.flatnonzero(pushes < 0)]

@@ -1,6 +1,6 @@
-"""A window that shows pictures, one after the other: GLFW's, which MuJoCo brings along.
+"""A window that shows pictures, one after the other, by GLFW, which is installed with MuJoCo.
 
-It needs a display, and lives in the thread that opened it (on macOS the main one).
+It needs a display, and is used only in the thread that opened it (on macOS the main one).
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class Window:
             self.close()
 
     def close(self) -> None:
-        """Close the window; once is enough."""
+        """Close the window; a second call does nothing."""
         self.is_open = False
         if self._window is not None:
             self._glfw.destroy_window(self._window)

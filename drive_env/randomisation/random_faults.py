@@ -55,7 +55,7 @@ class RandomFaults:
         return Order(row.name, begin, duration=duration, parameters=given)
 
     def table(self) -> dict[str, Any]:
-        """Return it as a TOML table."""
+        """Return this distribution as a TOML table."""
         found: dict[str, Any] = {"probability": self.probability, "names": list(self.names), "at": list(self.at)}
         if self.duration is not None:
             found["duration"] = list(self.duration)

@@ -178,7 +178,7 @@ class Envelope:
                 self._lend()
 
     def after_write(self, entry: Entry, raw: Integers, where: Mask) -> None:
-        """Note a write."""
+        """Update what depends on an object that was written: mode, set-points, scale, limits."""
         key = (entry.index, entry.sub)
         self._note_mode(key, where)
         if key == CONTROLWORD:
@@ -317,7 +317,7 @@ class Envelope:
             )
 
     def after_play(self, played: Mapping[Entry, Integers]) -> None:
-        """Note played rows."""
+        """Update what depends on rows that were played, as `after_write` does for their last row."""
         self._played = {}
         for entry, rows in played.items():
             if len(rows):

@@ -78,7 +78,7 @@ class Lending:
         return loan.own if loan is not None and found in loan.lent else found
 
     def owned(self, key: Key, axis: int) -> int:
-        """Return the own value of an object that has a lent one; KeyError if none is lent."""
+        """Return an object's own value, in whose place another one is lent; KeyError if none is lent."""
         return self._loans[key, axis].own
 
     def is_lent(self, key: Key, axis: int) -> bool:

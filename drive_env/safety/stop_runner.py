@@ -143,7 +143,7 @@ class StopRunner:
         )
 
     def cuts(self, words: Integers) -> Mask:
-        """Return where controlwords cut the voltage at once, by the present 605Ch of each axis."""
+        """Return the axes whose voltage controlwords cut at once, by the present 605Ch of each axis."""
         cuts: Mask = cia402.cuts_voltage(words)
         disables = cia402.matches(words, cia402.COMMANDS["disable operation"])
         key = DISABLE_OPERATION_OPTION
@@ -154,7 +154,7 @@ class StopRunner:
         return cuts
 
     def slow_ramps(self) -> Mask:
-        """Return where "disable operation" would take an axis out of its travel or last longer than STOP_WITHIN.
+        """Return the axes that "disable operation" would take out of their travel or brake for longer than STOP_WITHIN.
 
         A drive need not obey a quick stop during that ramp: only cutting the voltage would remain.
         """
@@ -167,7 +167,7 @@ class StopRunner:
         return slow
 
     def may_ramp_slowly(self) -> Mask:
-        """Return where "disable operation" brakes less than a quick stop."""
+        """Return the axes that "disable operation" brakes less than a quick stop does."""
         return self._disabling_ramp() < self._limits.bounds().braking
 
     def _disabling_ramp(self) -> Floats:
@@ -300,7 +300,7 @@ class StopRunner:
                     self._lending.lend(QUICK_STOP_OPTION, axis, _ENDS_HELD[option])
 
     def _release_what_no_weight_pulls(self, stop: Stop) -> None:
-        """Switch off axes that stand without current: while held, a drive may not watch its master."""
+        """Switch off held axes that need no current at rest: while it holds, a drive may not watch its master."""
         now, bounds = self._axes.now(), self._limits.latest
         for axis, one in stop.axes.items():
             if one.phase is not Phase.REST or not one.holds or one.rests_for(now) < WEIGHT_LOOK:

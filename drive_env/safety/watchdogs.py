@@ -51,7 +51,7 @@ class Watchdogs:
         self._is_lockstep_proved = False
 
     def check(self) -> None:
-        """Require arming anew if a drive, asked, no longer watches its master: it may have restarted.
+        """Ask the drives; require arming anew if one no longer watches its master, for example after a restart.
 
         Raises:
             BusError: If a node does not answer.

@@ -37,7 +37,7 @@ class CycleWatch(Protocol):
         """Raise SafetyError for rows that would pass a limit."""
 
     def after_play(self, played: Mapping[Entry, Integers]) -> None:
-        """Note played rows."""
+        """Update what depends on rows that were played."""
 
     def after_failed_play(self, played: Mapping[Entry, Integers]) -> None:
         """Note that the drives may have executed any of the rows."""

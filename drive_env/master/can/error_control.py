@@ -153,7 +153,7 @@ class ErrorControl:
             self._objects.change(_ERROR_BEHAVIOUR, bytes((stops[0],)), only_from=bytes((raw,)))
 
     def is_in_force(self) -> bool:
-        """Return whether the drive, asked, still watches over this master.
+        """Ask the drive whether it still watches over this master, and return its answer.
 
         Raises:
             BusError: If the node does not answer.
@@ -183,7 +183,7 @@ class ErrorControl:
         self.kind = "none"
 
     def forget(self) -> None:
-        """Forget the settings: the node was reset."""
+        """Delete the stored settings: the node was reset."""
         self._objects.forget()
         self.kind = "none"
 
@@ -241,7 +241,7 @@ class Beats:
         self.has_ceased = False  # permanent: a drive that cannot be proved off is to stop by itself
 
     def begin(self) -> None:
-        """Send several at once: a single one may be lost."""
+        """Send several heartbeats or requests at once: a single one may be lost."""
         for _ in range(FIRST_BEATS):
             self._beat()
 
@@ -251,7 +251,7 @@ class Beats:
             self._beat()
 
     def cease(self) -> None:
-        """Send the last ones: a node that was started in between watches again from these on, and then stops, too."""
+        """Send the last heartbeats or requests: a node started meanwhile watches from these on, and then stops, too."""
         self.has_ceased = True
         self.begin()
 
@@ -320,10 +320,10 @@ class ErrorControls:
         return self._controls[node].kind != "none"
 
     def is_in_force(self, node: int) -> bool:
-        """Return whether a node, asked, still watches over this master.
+        """Ask a node whether it still watches over this master, and return its answer.
 
         Raises:
-            BusError: If it does not answer.
+            BusError: If the node does not answer.
         """
         return self._controls[node].is_in_force()
 

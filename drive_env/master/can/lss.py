@@ -124,21 +124,21 @@ class LssMaster:
         return self._expect(Service.INQUIRE_NODE_ID)[1]
 
     def configure_node_id(self, node_id: int) -> None:
-        """Set its node-ID, in force after its next reset; 255 removes it.
+        """Set the node-ID of the slave in configuration, in force after its next reset; 255 removes the node-ID.
 
         Raises:
-            LssError: If it refuses or no slave answers.
+            LssError: If the slave refuses, or none answers.
         """
         answer = self._expect(Service.CONFIGURE_NODE_ID, bytes((node_id,)))
         if answer[1] != OK:
             raise LssError(f"the node refuses the node-ID {node_id} (error {answer[1]}, {answer[2]}); choose 1 to 127")
 
     def configure_bit_rate(self, bit_rate: int) -> None:
-        """Set its bit rate [bit/s], in force after activation or the next power-on.
+        """Set the bit rate [bit/s] of the slave in configuration, in force after activation or the next power-on.
 
         Raises:
             ValueError: For a bit rate that CiA 305 does not have.
-            LssError: If it refuses or no slave answers.
+            LssError: If the slave refuses, or none answers.
         """
         row = row_of(bit_rate)
         answer = self._expect(Service.CONFIGURE_BIT_TIMING, bytes((0, row)))
@@ -152,10 +152,10 @@ class LssMaster:
         self._send(Service.ACTIVATE_BIT_TIMING, round(1e3 * delay).to_bytes(2, "little"))
 
     def store(self, timeout: float) -> None:
-        """Store its node-ID and bit rate.
+        """Have the slave in configuration store its node-ID and bit rate.
 
         Raises:
-            LssError: If it cannot, or no slave answers within `timeout` [s].
+            LssError: If the slave cannot store them, or none answers within `timeout` [s].
         """
         answer = self._expect(Service.STORE, timeout=timeout)
         if answer[1] != OK:

@@ -183,7 +183,7 @@ class Port:
             self._bus.shutdown()
 
     def _take_turn(self, timeout: float, done: Callable[[], bool] | None) -> bool:
-        """Become the receiving thread within `timeout` [s]; False if another one stays it, or if `done`."""
+        """Become the receiving thread within `timeout` [s]; False if another thread keeps the turn, or if `done()`."""
         if self._receiving.acquire(blocking=False):
             return True
         begun = time.monotonic()

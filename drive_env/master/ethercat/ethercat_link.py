@@ -165,7 +165,7 @@ class EtherCatLink:
             self._await_boot(k)
 
     def states(self) -> list[int]:
-        """Return the states of the nodes, asked now."""
+        """Read the present states of the nodes."""
         return [self._master.status(position).state for position in self.nodes]
 
     def take_emergencies(self) -> list[ReceivedEmergency]:

@@ -94,7 +94,7 @@ class EtherCatMaster(Protocol):
         """Return the identity in a slave's EEPROM."""
 
     def status(self, position: int) -> SlaveStatus:
-        """Return a slave's state, asked now."""
+        """Read a slave's present state."""
 
     def map(self, sizes: Mapping[int, ImageSizes]) -> None:
         """Assign addresses to the images of slaves, and take the slaves from Pre-Op to Safe-Op.

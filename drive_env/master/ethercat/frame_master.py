@@ -177,7 +177,7 @@ class FrameMaster:
         return self._places[position].identity
 
     def status(self, position: int) -> SlaveStatus:
-        """Return a slave's state, asked now."""
+        """Read a slave's present state."""
         data = self.register(position, registers.AL_STATUS, 6)
         return SlaveStatus(0, False, 0) if data is None else _status(data)
 

@@ -114,7 +114,7 @@ class SoemMaster:
         return SlaveIdentity(slave.man, slave.id, slave.rev, int.from_bytes(serial or b"", "little"))
 
     def status(self, position: int) -> SlaveStatus:
-        """Return a slave's state, asked now."""
+        """Read a slave's present state."""
         data = self.register(position, registers.AL_STATUS, 6)
         if data is None:
             return SlaveStatus(0, False, 0)
