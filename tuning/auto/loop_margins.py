@@ -214,7 +214,7 @@ def _tell_variants(
     measured: MeasuredAxis | LinkedAxis | None,
     own: Integers,
 ) -> None:
-    """Add a reservation if a variant of the machine keeps too little of the dynamics; reject it below "stiff"."""
+    """Add a reservation if a variant of the machine keeps too little of the dynamics; reject the axis below "stiff"."""
     for dynamics, tell in ((bench.dynamics, journal.reserve), (find_dynamics("stiff"), journal.stop)):
         every = model.kept(dynamics, gains)
         if isinstance(measured, MeasuredAxis):
@@ -253,7 +253,7 @@ def _told_bounds(
 
 
 def tell_overshoot(bench: AutoBench, journal: Journal, overshoot: float) -> None:
-    """Add a reservation if a step in csp overshoots more than the dynamics allow; reject it beyond "stiff"."""
+    """Add a reservation if a step in csp overshoots more than the dynamics allow; reject the axis beyond "stiff"."""
     told = f"a step of the set-point by {STEP_SIZE} counts in csp overshoots by {100.0 * overshoot:.0f} %"
     for dynamics, tell in ((bench.dynamics, journal.reserve), (find_dynamics("stiff"), journal.stop)):
         if overshoot > dynamics.overshoot + OVERSHOOT_ERROR:

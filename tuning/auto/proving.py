@@ -120,7 +120,7 @@ class Shown(NamedTuple):
         return self.where & (without_noise(self.swing, self.noise) > RESTLESS)
 
     def replaced(self, later: Shown) -> Shown:
-        """Replace the axes of a later recording by it."""
+        """Return the recordings joined: the axes of the later one are taken from that."""
         every: Any = zip(self[1:], later[1:], strict=True)  # all fields except the times
         demand, actual, current, _, reason, *figures = (np.where(later.where, new, old) for old, new in every)
         return Shown(self.t, demand, actual, current, self.where | later.where, tuple(map(str, reason)), *figures)

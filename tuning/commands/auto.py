@@ -269,7 +269,7 @@ def _report(target: Target, result: Result, folder: Path, json: bool, search: Ma
 
 
 def _head(loop: str, titles: list[str]) -> str:
-    """Return the head of a column: the common first word of the titles, or the loop's name, and the gains below it."""
+    """Return a column's head: the titles' common first words, else the loop; below it, the rest of each title."""
     shared = titles[0].rpartition(" ")[0]
     return f"{shared or loop}\n{', '.join(title.removeprefix(shared).strip() for title in titles)}"
 

@@ -207,7 +207,7 @@ def _located(what: str, name: str, folder: Path) -> Path | None:
 
 
 def _named(what: str, name: str, folder: Path) -> str:
-    """Return a name of a suite unchanged, or the content of the file it names, which then stays with the machine."""
+    """Return a shipped name unchanged; for the path of a file, an `Input` with its content; raises ExperimentError."""
     try:
         return name if (place := _located(what, name, folder)) is None else taken(what, place)
     except ValueError as error:

@@ -156,7 +156,7 @@ def _likeness(angle: Floats, torque: Floats) -> float:
 
 
 def able(working: Working) -> tuple[Mask, list[str]]:
-    """Return which axes have room to turn to the field, to either side, and why the others have not."""
+    """Return which axes have enough travel on both sides for the field to pull their rotor; and why others have not."""
     down, up = working.room()
     # When switched on, the field pulls the rotor by at most half an electrical turn. From any position it can turn the
     # rotor back by as much.

@@ -110,12 +110,12 @@ class Experiments:
                 for found, chosen, wiring, fit in every]  # fmt: skip
 
     def begin(self, what: str, share: float, names: tuple[str, ...]) -> None:
-        """Report the present experiment and the share done; it and later ones give the values of these names."""
+        """Report the present experiment and the share done; this experiment and later ones give the values `names`."""
         self.progress(what, share)
         self._under_way = what, names
 
     def calm(self, working: Working) -> Working:
-        """Return the axes that did not oscillate; refuse missing values of the others with that reason."""
+        """Return the drives without the axes that oscillated, whose missing values are refused for that reason."""
         watch = watch_of(working.target.drives)
         swung = working.where & (np.zeros_like(working.where) if watch is None else watch.swung)
         what, names = self._under_way

@@ -510,7 +510,7 @@ def _friction(value: float, half: float, scale: float, unit: str, why: str) -> E
 
 
 def _weights(samples: int, cruises: tuple[tuple[int, int, int], ...]) -> tuple[list[Floats], list[int]]:
-    """Return smooth weights, shape (samples,) each, and the numbers of their moves.
+    """Return smooth weighting functions, shape (samples,) each, and the number of the move of each.
 
     One for every cruise, one for every change between two cruises; together they add up to 1. Smooth edges let the
     oscillation of an elastic load average out; sharp ones do not.

@@ -1,4 +1,4 @@
-"""The equation of motion of an axis under smooth weights, and its solution by least squares."""
+"""The equation of motion of an axis, integrated with smooth weighting functions, and its least-squares solution."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ class Motion(NamedTuple):
 
 
 class BalanceRows(NamedTuple):
-    """The momentum balance under n weights.
+    """The momentum balance, integrated with n weighting functions.
 
     columns: Coefficients of J/K, dry friction, viscous friction, offset, slope over the angle, drag; shape (n, 6).
     charge, duration: [A*s] and [s], shape (n,).
     moves: Number of the move of each row, shape (n,).
-    weights: The weights, shape (n, samples).
+    weights: The weighting functions, shape (n, samples).
     """
 
     columns: Floats
@@ -68,7 +68,7 @@ def step(t: Floats, begin: float, end: float) -> Floats:
 
 
 def balance_rows(did: Motion, weights: Sequence[Floats], moves: Sequence[int]) -> BalanceRows:
-    """Return the momentum balance under weights, shape (samples,) each, with the number of each one's move."""
+    """Return the balance integrated with weighting functions, shape (samples,) each; `moves`: the move of each."""
     w = np.array(weights)
     away = did.angle - float(did.angle.mean())
     signals = np.stack([did.sign, did.speed, np.ones_like(away), away, np.abs(did.speed) * did.speed], axis=1)

@@ -234,7 +234,7 @@ def pushed_inertia(ways: Floats, inertia: Floats) -> Floats:
 
 
 def loose(ratio: float) -> str:
-    """Return the message about a response with this ratio to the inertia of the moves."""
+    """Return the message about a response that gives this ratio of its inertia to that found in moves."""
     return (
         f"the frequency response gives {ratio:.2f} times the inertia found in the moves: it was measured within the "
         "play of a gear, where the motor turns alone"

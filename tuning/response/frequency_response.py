@@ -267,15 +267,16 @@ class _Measurement:
         return speed
 
     def _falling(self, shaker: Shaker, speed: Floats, passes: int, periods: int) -> Floats:
-        """Return the energy that weights feed back into the DC link in a run at such speeds [J], (num_axes,)."""
+        """Return the energy that weights feed back into the DC link in a run at these speeds [J], (num_axes,)."""
         steady, _ = shaker.steady(speed, passes, periods)
         return fed_back(self._target.motor, steady, CYCLE, 0.0, self._holding, self._friction)
 
     def _know_friction(self, trial: Pass, at_rest: Floats, sign: Floats) -> None:
-        """Separate weight and dry friction, which feeds nothing back, by currents in motion and at rest after it [A].
+        """Compute dry friction and holding current [A] from the currents in motion and at rest afterwards.
 
-        In motion along `sign` the current is weight + friction; against it -weight + friction, which is at least the
-        current at rest, where friction can hold any part up to its own value.
+        A weight feeds energy back, friction does not. In motion along `sign` the current is weight + friction; against
+        it -weight + friction, which is at least the current at rest, where friction can hold any part up to its own
+        value.
         """
         moving = trial.current.mean(axis=0)
         self._friction = np.maximum(0.5 * sign * (moving - at_rest), 0.0)

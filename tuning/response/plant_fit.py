@@ -188,7 +188,7 @@ def _weight(seen: Complex, spread: Floats) -> Floats:
 
 
 def _by_level(loop: _Loop, found: _Solution, less: Seen) -> tuple[Floats, str]:
-    """Return by how much parameters change beyond noise with less excitation, and why the pair is refused, else ""."""
+    """Return changes of parameters beyond noise with less excitation, and why the resonance is refused, else ""."""
     p = _with_resonance(_pack(found.model))
     if len(less.f) < FEWEST:
         return np.zeros(len(p)), (
@@ -262,7 +262,7 @@ def _scatter(loop: _Loop, found: _Solution, spread: Floats, parts: Sequence[Comp
 
 
 def _doubted(fit: PlantFit, reason: str) -> PlantFit:
-    """Return a fit with its pair refused."""
+    """Return a fit in which anti-resonance, resonance and damping are refused, with the reason."""
     from tuning.estimate import refused
 
     return fit._replace(estimates=fit.estimates | {name: refused(_UNITS[name], reason) for name in PAIR})
@@ -383,7 +383,7 @@ def _with_inertia(plant: Plant, device: Device, gains: Integers, f: Floats, roug
 
 
 def _candidate_pairs(loop: _Loop, rough: Complex, rigid: Plant) -> list[Plant]:
-    """Return plants with a pair as starting points: around the largest swing of the response, and on a coarse grid."""
+    """Return starting points with one resonance: around the response's largest swing, and on a coarse grid."""
     device, gains, f = loop.device, loop.gains, loop.f
     level = 20.0 * np.log10(np.abs(rough / velocity_plant(device, rigid, gains, f)))
     pairs = []
@@ -410,7 +410,7 @@ def _candidate_pairs(loop: _Loop, rough: Complex, rigid: Plant) -> list[Plant]:
 
 
 def _candidate_seconds(loop: _Loop, ones: list[_Solution]) -> list[_Model]:
-    """Return models with two pairs as starting points: the pair that was found, and another below or above it."""
+    """Return starting points with two resonances: the one that was found, and another below or above it."""
     models = []
     for plant in {round(one.model.plant.resonance): one.model.plant for one in ones}.values():
         mine = Pair(plant.anti_resonance, plant.resonance, min(plant.damping, 0.05))
@@ -429,7 +429,7 @@ def _candidate_seconds(loop: _Loop, ones: list[_Solution]) -> list[_Model]:
 
 
 def _middle(model: _Model) -> float:
-    """Return a measure of the position of a starting point's pairs [Hz^2]."""
+    """Return the product of a starting point's two anti-resonances [Hz^2]."""
     assert model.second is not None
     return model.second.anti_resonance * model.plant.anti_resonance
 

@@ -67,7 +67,7 @@ class Workbench:
         return 1.0 / inverse if inverse else math.inf
 
     def raw(self, part: Part, value: int) -> float:
-        """Set an integer that the rule searched itself; return it in SI units, an I gain in 1/s."""
+        """Set a gain to an integer that the rule has found itself; return the gain in SI units, an I gain in 1/s."""
         self._wanted[self._rows[part].name] = float(value)
         self._raw[part] = value
         return self.si(part, value)

@@ -316,7 +316,7 @@ def _made(scale: PositionScale, dictionary: ObjectDictionary, preset: Mapping[st
 
 
 def _same_gains(experiment: Experiment, name: str) -> tuple[SweptObject, ...]:
-    """Return an experiment's gains for another device: its gains of the same parts, converted to its units."""
+    """Return the swept gains for another device: the same part of the same loop; ExperimentError if it has none."""
     try:
         device = find_device(name)
     except ValueError as error:

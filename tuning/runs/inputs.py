@@ -60,7 +60,7 @@ class Input(str):
 
     @property
     def what(self) -> str:
-        """Its kind: "motor", "load" ..."""
+        """Kind of the input: "motor", "load" ..."""
         return self.kept.split("/")[1]
 
     @property
@@ -141,7 +141,7 @@ def as_kept(value: Any) -> Any:
 
 
 def found_in(value: Any, folder: Path) -> Any:
-    """Replace inputs by absolute paths in a run's folder, for a file that is read from elsewhere."""
+    """Replace inputs by the absolute paths of their copies in a run's folder, for a file outside that folder."""
     if isinstance(value, Input):
         return str(folder.absolute() / value.kept)
     if isinstance(value, Mapping):

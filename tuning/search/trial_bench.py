@@ -280,7 +280,7 @@ class TrialBench:
         return np.stack([speed, worse, 100.0 * self.method.current(terms)[:2].mean(axis=0)], axis=-1)
 
     def leave(self, gains: Integers) -> None:
-        """Leave the drives with gains, otherwise as they were before, at standstill."""
+        """Write final gains, restore the other settings, and switch off axes that were off before; at standstill."""
         drives = self.target.drives
         write_gains(drives, gains)
         for name, values in self._profile.items():

@@ -19,7 +19,7 @@ STOPS = 100
 
 
 class StiffnessSlider:
-    """The slider for the axis of one page; like the sliders of gains it shows while moving, and writes when released.
+    """The slider from soft to stiff for the axis of one page: moving it shows the gains, releasing it writes them.
 
     Args:
         panel: The page.

@@ -73,7 +73,7 @@ def set_gains(desk: TuneDesk, axis: int, wanted: dict[int, int], what: str) -> C
 
 
 def undo(desk: TuneDesk, axis: int) -> Callable[[Drives], str]:
-    """Return the job that undoes the newest change of an axis' gains, and returns its name."""
+    """Return the job that undoes the newest change of an axis' gains; the job returns the name of that change."""
 
     def job(drives: Drives) -> str:
         change = desk.last_change(axis)
