@@ -341,7 +341,7 @@ class Node:
 
     @property
     def clock(self) -> Clock:
-        """Its clock, which TIME sets."""
+        """The node's clock, which TIME sets."""
         return self._clock
 
     # --- conditions of the CAN controller -------------------------------------------------------------------------
@@ -383,7 +383,7 @@ class Node:
         self._reset_communication(now)
 
     def _take_bit_rate(self, origin: str) -> None:
-        """Be on the bus only if its bit rate is the node's."""
+        """Join the bus if its bit rate is the node's, else stay off; `origin`: its source, for the warning."""
         self._is_online = self._bus_bit_rate in (None, self.bit_rate)
         if not self._is_online:
             logger.warning(

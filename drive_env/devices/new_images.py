@@ -63,12 +63,12 @@ class _Pdo:
 
     @property
     def keys(self) -> set[Key]:
-        """Return the objects in it."""
+        """Return the mapped objects."""
         return {(raw >> 16, raw >> 8 & 0xFF) for raw in self.raws if raw >> 16}
 
     @property
     def size(self) -> int:
-        """Return its length [bytes]."""
+        """Return the length of the mapped data [bytes]."""
         return sum(raw & 0xFF for raw in self.raws) // 8
 
 

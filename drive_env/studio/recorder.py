@@ -103,7 +103,7 @@ class ScopeRecorder:
 
     @property
     def ring(self) -> SampleRing:
-        """The samples."""
+        """The ring with the newest samples."""
         return self._ring
 
     def keep(self, trace: Trace, asked: tuple[Key, ...], start: float, end: float) -> None:

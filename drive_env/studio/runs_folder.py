@@ -49,11 +49,11 @@ class Run:
 
     @property
     def when(self) -> str:
-        """Date and time of its last change."""
+        """Date and time of the run's last change."""
         return time.strftime("%Y-%m-%d %H:%M", time.localtime(self.changed))
 
     def of(self, kind: str) -> list[RunFile]:
-        """Return its files of a kind."""
+        """Return the run's files of a kind."""
         return [file for file in self.files if file.kind == kind]
 
     @property

@@ -140,7 +140,7 @@ class ScopeView:
 
     @property
     def status(self) -> str:
-        """Its state in a few words."""
+        """The scope's state in a few words."""
         if not self.is_running:
             return "halted"
         if self.mode == "roll":

@@ -93,7 +93,7 @@ class Job:
     is_told: bool = False  # whether the exception that stops it was raised: its cleanup must then be possible
 
     def refuse(self, error: BaseException) -> None:
-        """Fail before it begins, unless its page has cancelled it."""
+        """End the job with an error before it begins, unless its page has cancelled it."""
         if self.future.set_running_or_notify_cancel():
             self.future.set_exception(error)
 
