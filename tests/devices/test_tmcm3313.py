@@ -14,10 +14,9 @@ import pytest
 from rigs import ROOT
 from rigs.canopen_wire import Wire
 from rigs.tables import every_row
-from rigs.world_bus import WorldBus
+from rigs.world_bus import on_bus
 
-from drive_env import CanDrives, EmulatedDrives, motion
-from drive_env.bus.world import World
+from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
 from drive_env.dictionary.aborts import READ_ONLY, UNSUPPORTED_ACCESS, VALUE_RANGE, VALUE_TOO_HIGH, VALUE_TOO_LOW
 from drive_env.dictionary.roles import Role
@@ -454,15 +453,8 @@ def cyclic_move(drives):
 def test_cyclic_targets_over_can_are_what_they_are_in_process():
     with EmulatedDrives("tmcm3313", load="portal", num_threads=1, seed=4) as inside:
         expected = cyclic_move(inside)
-    world = World(lockstep=True)
-    world.add(EmulatedDrives("tmcm3313", load="portal", num_threads=1, seed=4), [1])
-    bus = WorldBus(world)
-    try:
-        with CanDrives("tmcm3313", bus=bus, nodes=(1,), pace="lockstep") as drives:
-            found = cyclic_move(drives)
-    finally:
-        bus.shutdown()
-        world.close()
+    with on_bus(EmulatedDrives("tmcm3313", load="portal", num_threads=1, seed=4)) as drives:
+        found = cyclic_move(drives)
     np.testing.assert_array_equal(found, expected)
     assert np.abs(expected[1, -1]).min() > 3000
 
