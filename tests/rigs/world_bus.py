@@ -45,8 +45,8 @@ class WorldBus(can.BusABC):
 
 
 @contextmanager
-def bus_of(emulated, nodes):
-    """A bus in lockstep with nodes of emulated drives, which end with it."""
+def bus_of(emulated, nodes, *, stay=False):
+    """A bus in lockstep with nodes of emulated drives, which end with it unless they `stay`."""
     world = World(lockstep=True)
     world.add(emulated, list(nodes))
     bus = WorldBus(world)
@@ -54,21 +54,22 @@ def bus_of(emulated, nodes):
         yield bus
     finally:
         bus.shutdown()
-        world.close()
+        if not stay:
+            world.close()
 
 
 @contextmanager
-def on_bus(emulated, nodes=None, **options):
+def on_bus(emulated, nodes=None, *, stay=False, **options):
     """Emulated drives on a bus in lockstep, by our master: by default as nodes 1 and so on, of a device that it knows.
 
     Args:
-        emulated: The drives, which end with the bus.
+        emulated: The drives, which end with the bus unless they `stay`.
         nodes: The numbers of their nodes.
         options: The master's.
     """
     nodes = nodes or range(1, 1 + math.ceil(emulated.num_axes / emulated.device.num_axes))
     known = {"device": emulated.device.name} | options
-    with bus_of(emulated, nodes) as bus, CanDrives(bus=bus, nodes=nodes, pace="lockstep", **known) as drives:
+    with bus_of(emulated, nodes, stay=stay) as bus, CanDrives(bus=bus, nodes=nodes, pace="lockstep", **known) as drives:
         yield drives
 
 
