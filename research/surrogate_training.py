@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from agents.policies.agent_file import AgentFile, installed
 from agents.tuner.known_range import HOLDS
@@ -32,13 +31,10 @@ from drive_env.devices import find_device
 from drive_env.envs.gain_tuning import GainTuning, GainTuningConfig
 from drive_env.loops.dynamics import DEFAULT, find_dynamics
 from drive_env.trials.score import TRIP
+from mechanics.arrays import Floats, Mask, Singles
 from mechanics.reading.untrusted import read_arrays
 from research.tuner_recipes import RECIPES, Recipe, TrainingMachines, laws
 from tuning.bootstrap import bootstrap_interval
-
-Floats = NDArray[np.float64]
-Array = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 ENVIRONMENT = "ServoDrive/GainTuning-v0"
 TRIALS = 10  # of an episode
@@ -125,7 +121,7 @@ def collect(
 
     rng = np.random.default_rng(seed)
     G = len(recipe.gains)
-    columns: tuple[list[Array], ...] = ([], [], [])
+    columns: tuple[list[Singles], ...] = ([], [], [])
     dynamics = _random_dynamics(rng, recipe.dynamics)
     policy = None if agent is None else asked_for(agent, dynamics)
     with machines_of(recipe, row, machines, trials=trials, step=2.0 * FARTHEST, dynamics=dynamics) as env:
@@ -169,12 +165,12 @@ def asked_for(agent: AgentFile, dynamics: str) -> SurrogatePolicy:
     return SurrogatePolicy(replace(agent, configuration={**agent.configuration, "dynamics": dynamics}))
 
 
-def _shown(observation: Array, gains: int) -> Array:
+def _shown(observation: Singles, gains: int) -> Singles:
     at = IDENTIFIED + 2 * gains
     return np.asarray(observation[:, at : at + SHOWN], np.float32)
 
 
-def bundle_of(recipe: Recipe, arrays: Mapping[str, Array], card: Mapping[str, Any]) -> AgentFile:
+def bundle_of(recipe: Recipe, arrays: Mapping[str, Singles], card: Mapping[str, Any]) -> AgentFile:
     """Return the agent."""
     ends = {"low": list(recipe.low), "high": list(recipe.high)}
     settings = {"gains": len(recipe.gains), "step": STEP, **ends, **SETTINGS}

@@ -18,11 +18,11 @@ from drive_env.devices import find_device
 from drive_env.dictionary.entries import ObjectDictionary, ObjectName, Rows
 from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count, counts_per_ampere
-from drive_env.drives.interface import Drives, Observer
+from drive_env.drives.interface import CYCLE, Drives, Observer
 from drive_env.drives.speeds import per_increment
 from drive_env.drives.trace import Trace
 from drive_env.trials.oscillation import OSCILLATION
-from drive_env.trials.positioning import CYCLE, wrapped
+from drive_env.trials.positioning import wrapped
 from mechanics.arrays import Floats, Integers, Mask
 from tuning.move_counter import MoveCounter
 from tuning.target import Target

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drive_env.dictionary.roles import Role
-from drive_env.trials.positioning import CYCLE, PROFILE, TRAVEL_SHARE, highest_ramp, plan_move
+from drive_env.drives.interface import CYCLE
+from drive_env.trials.positioning import PROFILE, TRAVEL_SHARE, highest_ramp, plan_move
 from mechanics.arrays import Floats, Mask
 
 if TYPE_CHECKING:

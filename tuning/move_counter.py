@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from drive_env import cia402
 from drive_env.cia402 import Key
-from drive_env.trials.positioning import CYCLE
+from drive_env.drives.interface import CYCLE
 from mechanics.arrays import Floats, Integers, Mask
 
 REST = 20  # cycles at rest that end a move

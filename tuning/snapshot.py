@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from drive_env import cia402, motion
+from drive_env import cia402
 from drive_env.cia402 import Key
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.access import check_in_range, check_writable
-from drive_env.drives.interface import Drives, device_of
+from drive_env.drives.interface import CYCLE, Drives, device_of
 from drive_env.fieldbus.description import Description, describe
 from drive_env.fieldbus.errors import BusError
 from drive_env.held_signals import held_signals
@@ -470,8 +470,8 @@ def switch_off(drives: Drives, where: Mask) -> None:
     for _ in range(SWITCH_OFF):
         if not np.any(where & [cia402.is_live(int(word)) for word in drives.read(cia402.STATUSWORD)]):
             return
-        drives.advance(motion.STEP)
-    raise TimeoutError(f"an axis stays enabled for {SWITCH_OFF * motion.STEP:g} s after its voltage was switched off")
+        drives.advance(CYCLE)
+    raise TimeoutError(f"an axis stays enabled for {SWITCH_OFF * CYCLE:g} s after its voltage was switched off")
 
 
 def can_store(target: Target) -> bool:

@@ -24,11 +24,12 @@ from agents.policies.baselines import baseline
 from agents.shipped import TUNER
 from agents.tasks import short_name
 from drive_env import EmulatedDrives, motion
+from drive_env.drives.interface import CYCLE
 from drive_env.drives.raw_gains import write_gains
 from drive_env.envs import ENVIRONMENTS
 from drive_env.envs.suite import TASKS
 from drive_env.pictures.demonstration import PictureFormat
-from drive_env.pictures.recording import CYCLE, Recorder
+from drive_env.pictures.recording import Recorder
 from drive_env.pictures.render import Picture
 from drive_env.trials.gain_trial import PROBE
 from mechanics.arrays import Integers

@@ -12,10 +12,11 @@ from typing import NamedTuple
 import numpy as np
 
 from drive_env.bus.faults import Faults
-from drive_env.bus.world import CYCLE, World
+from drive_env.bus.world import World
 from drive_env.canopen.frames import NMT, Frame
 from drive_env.canopen.node import Node
 from drive_env.drives.arguments import whole_cycles
+from drive_env.drives.interface import CYCLE
 from drive_env.emulator.emulated_drives import EmulatedDrives
 from drive_env.emulator.machine_faults import axes_that_fulfil
 from drive_env.faults.schedule import NEVER, Condition, Order, cycles_of

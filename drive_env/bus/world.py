@@ -11,9 +11,9 @@ from drive_env.bus.wire import Transmission, Wire
 from drive_env.canopen.frames import SYNC, Frame
 from drive_env.canopen.lss import UNCONFIGURED
 from drive_env.canopen.node import Node
+from drive_env.drives.interface import CYCLE
 from drive_env.emulator.emulated_drives import EmulatedDrives
 
-CYCLE = 0.001  # s: the communication cycle
 # Frames of a node that may wait for the bus, per axis; our choice, since no manual gives one. Further ones are lost.
 TRANSMIT_BUFFER = 64
 MAX_NODE_ID = 127

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from drive_env.commands.options import Json, errors_as_exit_codes, print_json
+from drive_env.commands.options import Json, errors_as_exit_codes, print_result
 from drive_env.commands.progress import progress_on
 from drive_env.default_device import DEFAULT_DEVICE
 
@@ -47,12 +47,10 @@ def compile_kernels(
             raise OSError(f"no kernel could be stored in {folder}; set DRIVE_ENV_CACHE to a writable folder")
         compiled = len(after - before)
         seconds = time.monotonic() - began
-    if json:
-        print_json({"compiled": compiled, "seconds": round(seconds, 1), "folder": str(folder)})
-    elif compiled:
-        print(f"compiled {compiled} kernels in {seconds:.0f} s; they are stored in {folder}")
-    else:
-        print(f"nothing to compile: the kernels of these sources are in {folder}")
+    told = f"compiled {compiled} kernels in {seconds:.0f} s; they are stored in {folder}"
+    if not compiled:
+        told = f"nothing to compile: the kernels of these sources are in {folder}"
+    print_result({"compiled": compiled, "seconds": round(seconds, 1), "folder": str(folder)}, [told], json)
 
 
 def _steps(devices: list[str]) -> dict[str, Callable[[], None]]:

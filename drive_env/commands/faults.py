@@ -16,9 +16,8 @@ from drive_env.commands.options import (
     errors_as_exit_codes,
     fail,
     grouped,
-    print_json,
+    print_result,
 )
-from drive_env.commands.tables import print_lines
 
 if TYPE_CHECKING:
     from drive_env.drives.reported_faults import FaultReport
@@ -39,11 +38,8 @@ def faults(*, bus: AxesOptions, eds: Eds = None, json: Json = False) -> None:
         with bus.connect(eds, safety=False) as drives:
             chosen = axes_of_nodes(drives, bus.axis)
             reports = [report for report in read_faults(drives, drives.description) if report.axis in chosen]
-            if json:
-                print_json([axis_place(drives, report.axis) | _row(report) for report in reports])
-            else:
-                for report in reports:
-                    print_lines(_lines(axis_name(drives, report.axis), report))
+            lines = [line for report in reports for line in _lines(axis_name(drives, report.axis), report)]
+            print_result([axis_place(drives, report.axis) | _row(report) for report in reports], lines, json)
         wrong = sum(report.is_fault for report in reports)
         if wrong:
             fail(f"{wrong} of {len(reports)} axes in fault; {RESET}", REFUSED)

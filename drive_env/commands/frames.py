@@ -27,6 +27,7 @@ from drive_env.commands.options import (
     errors_as_exit_codes,
     fail,
     print_json,
+    print_result,
 )
 from drive_env.drives.arguments import LONGEST
 
@@ -125,7 +126,7 @@ def log(
             fail(f"the bus was lost: {lost}; the {count} frames received before are {kept}", REFUSED)
         if left_out:
             print(f"drive-env: {ending} has no {NOT_HELD[ending]}: {left_out} frames are left out", file=sys.stderr)
-        _say(f"{count} frames written to {file}", result, json)
+        print_result(result, [f"{count} frames written to {file}"], json)
 
 
 @frames_app.command()
@@ -173,7 +174,7 @@ def replay(
         if dry_run:
             for frame in frames:
                 print(show_frame(frame.arbitration_id, frame.data, frame.dlc if frame.is_remote_frame else None))
-            _say(f"{len(frames)} frames shown", {"frames": len(frames)}, json)
+            print_result({"frames": len(frames)}, [f"{len(frames)} frames shown"], json)
             return
         patience = ANSWER_TIMEOUT if timeout is None else check_timeout(timeout)
         port = Port(open_bus(interface, channel, **({"bitrate": bitrate} if bitrate else {})))
@@ -233,7 +234,8 @@ def _replay(port: Any, frames: list[Any], speed: float, timeout: float, json: bo
         raise problem
     if noted:
         fail(f"interrupted; {sent} of {len(frames)} frames were sent, and no motor is left enabled", INTERRUPTED)
-    _say(f"{sent} frames sent", {"frames": sent, "stopped": [axis._asdict() for axis in stopped]}, json)
+    result = {"frames": sent, "stopped": [axis._asdict() for axis in stopped]}
+    print_result(result, [f"{sent} frames sent"], json)
 
 
 def _in_time(port: Any, frames: list[Any], speed: float, noted: list[int]) -> Iterator[Any]:
@@ -275,10 +277,3 @@ def _check_format(file: Path, ending: str) -> None:
 def _is_held(message: Any, ending: str) -> bool:
     """Return whether a format has room for a frame; python-can would drop it, or write it as another one."""
     return ending not in NOT_HELD or not (message.is_fd or (message.is_remote_frame and ending == ".trc"))
-
-
-def _say(text: str, value: dict[str, Any], json: bool) -> None:
-    if json:
-        print_json(value)
-    else:
-        print(text)

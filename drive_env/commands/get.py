@@ -24,7 +24,7 @@ from drive_env.commands.options import (
     fail,
     grouped,
     object_name,
-    print_json,
+    print_result,
     scales_of,
     told_if_interrupted,
 )
@@ -58,11 +58,8 @@ def get(
         for entry in entries:
             values = drives.read((entry.index, entry.sub))
             rows += [(k, entry, values[k], scales[k]) for k in axes_of(drives, entry, bus.axis)]
-        if json:
-            print_json([axis_place(drives, k) | _row(*row) for k, *row in rows])
-            return
-        for k, entry, value, scale in rows:
-            print(f"{axis_name(drives, k)}  {entry.label} = {_text(value, entry, scale, raw)}")
+        lines = [f"{axis_name(drives, k)}  {e.label} = {_text(value, e, scale, raw)}" for k, e, value, scale in rows]
+        print_result([axis_place(drives, k) | _row(*row) for k, *row in rows], lines, json)
 
 
 @grouped
@@ -117,11 +114,8 @@ def set_object(
         with told_if_interrupted(f"{entry.label} may be {value} by now; drive-env get {name!r} shows it"):
             _write(drives, entry, chosen, wanted if drives.description.is_number(entry) else value)
             found = drives.read((entry.index, entry.sub)) if readable else wanted
-        if json:
-            print_json([axis_place(drives, k) | _row(entry, found[k], scales[k]) for k in chosen])
-        else:
-            for k in chosen:
-                print(f"{axis_name(drives, k)}  {entry.label} = {_text(found[k], entry, scales[k], raw)}")
+        lines = [f"{axis_name(drives, k)}  {entry.label} = {_text(found[k], entry, scales[k], raw)}" for k in chosen]
+        print_result([axis_place(drives, k) | _row(entry, found[k], scales[k]) for k in chosen], lines, json)
         asked = _without_remote_frames(entry, [wanted[k] for k in chosen], [found[k] for k in chosen])
         differs = readable and any(found[k] != one for k, one in zip(chosen, asked, strict=True))
         # Objects such as 1010h take a signature and read another value.
@@ -148,19 +142,15 @@ def _tell_plan(
     for one in wanted if is_number else []:
         check_limits(entry, one)
     found = drives.read((entry.index, entry.sub)) if entry.access != "wo" else [None] * drives.num_axes
-    if json:
-        rows = [
-            axis_place(drives, axis) | {"object": f"{entry.index:04X}h:{entry.sub:02X}", "is": found[axis],
-                                        "would be": wanted[axis]}
-            for axis in axes
-        ]  # fmt: skip
-        print_json(rows)
-        return
+    rows, lines = [], []
     for axis in axes:
-        scale = scales[axis]
-        now = "" if found[axis] is None else f" is {_text(found[axis], entry, scale, raw)};"
-        then = _text(wanted[axis], entry, scale, raw) if is_number else text
-        print(f"{axis_name(drives, axis)}  {entry.label}{now} {then} would be written (dry run: nothing was written)")
+        of_object = {"object": f"{entry.index:04X}h:{entry.sub:02X}", "is": found[axis], "would be": wanted[axis]}
+        rows.append(axis_place(drives, axis) | of_object)
+        now = "" if found[axis] is None else f" is {_text(found[axis], entry, scales[axis], raw)};"
+        then = _text(wanted[axis], entry, scales[axis], raw) if is_number else text
+        written = f"{then} would be written (dry run: nothing was written)"
+        lines.append(f"{axis_name(drives, axis)}  {entry.label}{now} {written}")
+    print_result(rows, lines, json)
 
 
 def _refuse_to_enable(entry: Any, controlword: int) -> None:

@@ -33,8 +33,8 @@ from drive_env.commands.options import (
     fail,
     grouped,
     print_json,
+    print_result,
 )
-from drive_env.commands.tables import print_lines
 
 SETTLING = 40  # checks, a STANDSTILL apart, within which an axis must come to rest at home
 REACHED = cia402.TARGET_REACHED.mask  # at rest, which the command determines by the position
@@ -167,13 +167,11 @@ def _print_methods(one: OneAxis, there: list[int], json: bool) -> None:
 
     is_known = one.drives.description.device is not None
     texts = {number: _text(number, is_known) for number in there or METHODS}
-    if json:
-        print_json(axis_place(one.drives, one.axis) | {"method": 0, "methods": texts})
-        return
-    print(
-        f"homing methods of {one.name}:" if there else f"homing methods of CiA 402; {one.name} does not list its own:"
-    )
-    print_lines(f"  {number:>3}  {text}" for number, text in texts.items())
+    title = f"homing methods of {one.name}:"
+    if not there:
+        title = f"homing methods of CiA 402; {one.name} does not list its own:"
+    lines = [title, *(f"  {number:>3}  {text}" for number, text in texts.items())]
+    print_result(axis_place(one.drives, one.axis) | {"method": 0, "methods": texts}, lines, json)
 
 
 def _find_home(one: OneAxis, within: float) -> None:

@@ -19,9 +19,8 @@ from drive_env.commands.options import (
     check_time,
     errors_as_exit_codes,
     fail,
-    print_json,
+    print_result,
 )
-from drive_env.commands.tables import print_lines
 
 if TYPE_CHECKING:
     from drive_env.canopen.lss import LssIdentity
@@ -75,10 +74,8 @@ def scan_lss(
         check_time("--timeout", timeout)
         with _open(interface, channel, bitrate, timeout) as (_, master), master.configuring():
             found = list(master.scan())
-        if json:
-            print_json([{**one._asdict(), "identity": show(one)} for one in found])
-        else:
-            print_lines([f"no node-ID  {_facts(one)}  --identity {show(one)}" for one in found])
+        rows = [{**one._asdict(), "identity": show(one)} for one in found]
+        print_result(rows, [f"no node-ID  {_facts(one)}  --identity {show(one)}" for one in found], json)
         if not found:
             fail(
                 "no node without a node-ID answered; those that have one are found by `drive-env scan`, and a drive "

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NoReturn, get_type_h
 
 import typer
 
+from drive_env.commands.tables import print_lines
 from drive_env.default_device import DEFAULT_DEVICE
 from drive_env.programs import CLOSED, output_is_closed
 
@@ -353,6 +354,14 @@ def fail(error: object, code: int) -> NoReturn:
     """End the command with a red line."""
     typer.secho(f"drive-env: {error}", fg=typer.colors.RED, err=True)
     raise typer.Exit(code)
+
+
+def print_result(value: Any, lines: Iterable[str], json: bool) -> None:
+    """Print the result of a command: its value as JSON, or its lines for a reader."""
+    if json:
+        print_json(value)
+    else:
+        print_lines(lines)
 
 
 def print_json(value: Any) -> None:

@@ -24,6 +24,7 @@ from drive_env.commands.options import (
     grouped,
     names_a_bus,
     print_json,
+    print_result,
     scales_of,
     told_if_interrupted,
 )
@@ -78,10 +79,8 @@ def backup(
             print_text(text)
             return
         write_whole(file, text)
-        if json:
-            print_json({"file": str(file), "parameters": len(values)})
-        else:
-            print(f"{len(values)} parameters of node {bus.number} written to {file}")
+        told = [f"{len(values)} parameters of node {bus.number} written to {file}"]
+        print_result({"file": str(file), "parameters": len(values)}, told, json)
 
 
 @parameters_app.command()
@@ -258,22 +257,18 @@ def _exchange(
             "`drive-env parameters diff`, then restore again",
             REFUSED,
         )
-    if json:
-        rows = [_row(change, scale) for change in changes]
-        print_json({"changed": rows, "verified": len(wanted), "stored": store})
-    else:
-        lost = "; not stored: lost at the next reset (--store stores them)" if changes else ""
-        kept = "; stored in the drive" if store else lost
-        print(f"{len(changes)} written, {len(wanted)} verified by a second reading{kept}")
+    lost = "; not stored: lost at the next reset (--store stores them)" if changes else ""
+    kept = "; stored in the drive" if store else lost
+    rows = [_row(change, scale) for change in changes]
+    lines = [f"{len(changes)} written, {len(wanted)} verified by a second reading{kept}"]
+    print_result({"changed": rows, "verified": len(wanted), "stored": store}, lines, json)
 
 
 def _tell_plan(differences: list[Any], scale: Scale, node: int, *, store: bool, json: bool) -> None:
-    if json:
-        rows = [_row(difference, scale) for difference in differences]
-        print_json({"would change": rows, "would store": store, "written": 0})
-        return
+    rows = [_row(difference, scale) for difference in differences]
     kept = ", and stored" if store else ""
-    print(f"{len(differences)} parameters would be written to node {node}{kept} (dry run: nothing was written)")
+    told = [f"{len(rows)} parameters would be written to node {node}{kept} (dry run: nothing was written)"]
+    print_result({"would change": rows, "would store": store, "written": 0}, told, json)
 
 
 def _tell_of_changes(file: Path) -> None:

@@ -17,6 +17,7 @@ from drive_env.commands.options import (
     errors_as_exit_codes,
     fail,
     print_json,
+    print_result,
 )
 from drive_env.commands.tables import print_lines
 
@@ -93,13 +94,12 @@ def _scan_ethercat(interface: str | None, channel: str | None, json: bool) -> No
         device = device_of(0, identity.vendor, identity.product)
         state = state_name(status.state) + (f", error {status.code:04X}h" if status.has_error else "")
         rows.append({"position": position, "device": device, "state": state} | identity._asdict())
-    if json:
-        print_json(rows)
-        return
+    lines = []
     for row in rows:
         numbers = "  ".join(f"{name} {row[name]:X}h" for name in ("vendor", "product", "revision", "serial"))
         known = row["device"] or "unknown device; give its EDS with --eds"
-        print_lines([f"position {row['position']}  {known}  {numbers}  {row['state']}"])
+        lines.append(f"position {row['position']}  {known}  {numbers}  {row['state']}")
+    print_result(rows, lines, json)
 
 
 def _find(port: Any, first: int, last: int, timeout: float) -> set[tuple[int, str, int]]:

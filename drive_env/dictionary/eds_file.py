@@ -36,7 +36,6 @@ SIGNED = {getattr(datatypes, f"INTEGER{bits}"): bits for bits in (8, 16, 24, 32,
 UNSIGNED = {getattr(datatypes, f"UNSIGNED{bits}"): bits for bits in (8, 16, 24, 32, 40, 48, 56, 64)}
 UNSIGNED |= {datatypes.BOOLEAN: 1}
 FLOATS = (datatypes.REAL32, datatypes.REAL64)
-USER_TYPES = 0x1B  # data types from here on are defined in the file itself (CiA 301)
 HEADERS = ("FileInfo", "DeviceInfo", "DeviceComissioning", "DummyUsage", "Comments", "MandatoryObjects",
            "OptionalObjects", "ManufacturerObjects")  # fmt: skip
 LISTS = HEADERS[-3:]

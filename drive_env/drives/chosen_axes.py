@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from drive_env.drives.arguments import checked_mask
 from drive_env.drives.drives_proxy import DrivesProxy
-from drive_env.drives.interface import Drives, SafetyWatch
+from drive_env.drives.interface import CYCLE, Drives, SafetyWatch
 from drive_env.drives.trace import Trace
 from mechanics.arrays import Integers, Mask
 
@@ -117,7 +117,7 @@ class ChosenAxes(DrivesProxy):
         mask[self._axes[checked_mask(where, self.num_axes)]] = True
         return mask
 
-    def record(self, objects: ObjectNames, duration: float, play: Rows = None, period: float = 0.001) -> Trace:
+    def record(self, objects: ObjectNames, duration: float, play: Rows = None, period: float = CYCLE) -> Trace:
         """Let time pass while objects of the chosen axes are recorded and played."""
         rows = {name: self._rows(name, np.asarray(values)) for name, values in (play or {}).items()}
         return self._drives.record(objects, duration, rows or None, period).of_axes(self._axes.tolist())

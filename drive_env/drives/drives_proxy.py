@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Self
 
 from numpy.typing import ArrayLike
 
-from drive_env.drives.interface import BusSide, Drives, MachineSide, Observer, SafetyWatch
+from drive_env.drives.interface import CYCLE, BusSide, Drives, MachineSide, Observer, SafetyWatch
 from drive_env.drives.trace import Trace
 from mechanics.arrays import Integers, Mask
 
@@ -80,7 +80,7 @@ class DrivesProxy:
         """Let time pass [s]."""
         self._drives.advance(duration)
 
-    def record(self, objects: ObjectNames, duration: float, play: Rows = None, period: float = 0.001) -> Trace:
+    def record(self, objects: ObjectNames, duration: float, play: Rows = None, period: float = CYCLE) -> Trace:
         """Let time pass [s] while objects are recorded and played."""
         return self._drives.record(objects, duration, play, period)
 

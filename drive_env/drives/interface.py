@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from drive_env.fieldbus.link import Link, ObjectReader, Timing
     from mechanics.load import Load
 
+CYCLE = 0.001  # s, the communication cycle: drives advance by whole ones, and record one row in each
+
 
 class BasicDrives(AxisObjects, Protocol):
     """Drives as needed to move axes: objects that are read and written, and time that passes."""
@@ -193,7 +195,7 @@ class Drives(BasicDrives, Protocol):
     def observers(self) -> tuple[Observer, ...]:
         """The observers of these drives, the innermost first."""
 
-    def record(self, objects: ObjectNames, duration: float, play: Rows = None, period: float = 0.001) -> Trace:
+    def record(self, objects: ObjectNames, duration: float, play: Rows = None, period: float = CYCLE) -> Trace:
         """Let time pass [s] while objects are recorded, and others, the keys of `play`, are written row by row."""
 
     def emergencies(self) -> list[EmergencyMessage]:

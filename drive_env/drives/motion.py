@@ -14,7 +14,7 @@ from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.axis_objects import read_if_there
 from drive_env.dictionary.roles import Role
 from drive_env.drives.homing import zero_speeds
-from drive_env.drives.interface import BasicDrives, axis_number
+from drive_env.drives.interface import CYCLE, BasicDrives, axis_number
 from mechanics.arrays import Integers, Mask
 
 if TYPE_CHECKING:
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 
 WIDEST = 2**31  # increments: a larger window means that it is switched off
 
-STEP = 0.001  # time between two reads of the statusword [s]
 MODE_PATIENCE = 0.25  # s to wait for a mode before halting or giving up
 TAKEN_BACK = 0.05  # s after which a set-point whose acknowledge stays is in a drive's buffer
 REST = 0.25  # s at the target or at home after which a drive without bit 10 has arrived
@@ -87,8 +86,8 @@ def wait_for(
                 f"axis {number} did not reach {what} in {timeout:g} s: statusword {status[axis]:04X}h"
                 + _why_not_heard(drives, int(status[axis]))
             )
-        drives.advance(STEP)
-        waited += STEP
+        drives.advance(CYCLE)
+        waited += CYCLE
 
 
 def _why_not_heard(drives: BasicDrives, status: int) -> str:
@@ -173,8 +172,8 @@ def _await_mode(drives: BasicDrives, mode: str, axes: Mask, timeout: float = 1.0
     late = _not_in_mode(drives, mode, axes)
     waited = 0.0
     while late.any() and waited < MODE_PATIENCE:
-        drives.advance(STEP)
-        waited += STEP
+        drives.advance(CYCLE)
+        waited += CYCLE
         late = _not_in_mode(drives, mode, late)
     halted = late & cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED) if late.any() else late
     if not halted.any():
@@ -189,8 +188,8 @@ def _await_mode(drives: BasicDrives, mode: str, axes: Mask, timeout: float = 1.0
                 f"axis {number} did not change to {mode} in {timeout:g} s, at a halt neither: 6061h shows another "
                 "mode, and the axis is halted; disable it, then select the mode"
             )
-        drives.advance(STEP)
-        waited += STEP
+        drives.advance(CYCLE)
+        waited += CYCLE
         late = _not_in_mode(drives, mode, late)
     drives.write(cia402.CONTROLWORD, cia402.ENABLE_OPERATION, where=halted)
 
@@ -217,7 +216,7 @@ def _own_modes(drives: BasicDrives) -> Mapping[int, int]:
 
 def _enable_again(drives: BasicDrives, axes: Mask) -> None:
     """Enable axes that the change of the manufacturer's mode has stopped."""
-    drives.advance(STEP)
+    drives.advance(CYCLE)
     lost = axes & ~cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED)
     if lost.any():
         wait_for(drives, cia402.SWITCH_ON_DISABLED, STOP_TIMEOUT, "the end of the stop for its own mode", lost)
@@ -240,7 +239,7 @@ def take_command(drives: BasicDrives, where: Mask | None = None) -> None:
     known = ignores & (needed >= 0)
     if known.any():
         drives.write(Role.MODE_GATE, np.maximum(needed, 0), where=known)
-        drives.advance(STEP)  # the drive checks it once per period
+        drives.advance(CYCLE)  # the drive checks it once per period
 
 
 def enable(drives: BasicDrives, mode: str | None = None, where: Mask | None = None, timeout: float = 1.0) -> None:
@@ -317,7 +316,7 @@ def _command_stop(drives: BasicDrives, word: int, where: Mask | None) -> None:
     drives.write(cia402.CONTROLWORD, word, where=where)
     if not _own_modes(drives):
         return
-    drives.advance(STEP)  # a statusword may be older than another program's change of the manufacturer's mode
+    drives.advance(CYCLE)  # a statusword may be older than another program's change of the manufacturer's mode
     ignored = ~cia402.matches(drives.read(cia402.STATUSWORD), cia402.REMOTE)
     ignored = ignored if where is None else ignored & where
     if ignored.any():
@@ -344,8 +343,8 @@ def reset_fault(drives: BasicDrives, where: Mask | None = None, timeout: float =
             axis = int(np.flatnonzero(late)[0])
             number = axis_number(drives, axis)
             raise TimeoutError(f"axis {number} stays in fault: the cause is still there; see emergencies()")
-        drives.advance(STEP)
-        waited += STEP
+        drives.advance(CYCLE)
+        waited += CYCLE
     drives.write(cia402.CONTROLWORD, cia402.DISABLE_VOLTAGE, where=where)
 
 
@@ -412,8 +411,8 @@ def _still_acknowledged(drives: BasicDrives, where: Mask | None) -> Mask:
         kept = axes & cia402.matches(drives.read(cia402.STATUSWORD), cia402.SET_POINT_ACKNOWLEDGED)
         if not kept.any() or waited >= TAKEN_BACK:
             return np.asarray(kept)
-        drives.advance(STEP)
-        waited += STEP
+        drives.advance(CYCLE)
+        waited += CYCLE
 
 
 def move_to(
@@ -561,8 +560,8 @@ def _await_home(drives: BasicDrives, axes: Mask, timeout: float) -> None:
     """Let time pass until the axes have completed homing."""
     waited, silent = 0.0, 0
     while True:
-        drives.advance(2 * STEP)  # the first look must come after the drive has begun
-        waited += 2 * STEP
+        drives.advance(2 * CYCLE)  # the first look must come after the drive has begun
+        waited += 2 * CYCLE
         status = drives.read(cia402.STATUSWORD)
         fault = axes & cia402.matches(status, cia402.FAULT_BIT)
         bits = status & cia402.HOMING_BITS
@@ -579,7 +578,7 @@ def _await_home(drives: BasicDrives, axes: Mask, timeout: float) -> None:
             break
         # Bit 12 alone: home was left again for the resting position, or the drive has no bit 10.
         silent = silent + 1 if np.all(bits[still] == cia402.HOMING_UNDER_WAY[1]) else 0
-        if silent * 2 * STEP >= REST and _rests(drives, still):
+        if silent * 2 * CYCLE >= REST and _rests(drives, still):
             break
         if waited >= timeout:
             axis = int(np.flatnonzero(axes & (bits != cia402.HOMED))[0])

@@ -9,14 +9,12 @@ from numpy.typing import ArrayLike
 
 from drive_env.dictionary.roles import Role
 from drive_env.drives.drives_proxy import DrivesProxy
-from drive_env.drives.interface import Drives, MachineSide, Observer
+from drive_env.drives.interface import CYCLE, Drives, MachineSide, Observer
 from drive_env.drives.trace import Trace
 from mechanics.arrays import Mask
 
 if TYPE_CHECKING:
     from drive_env.dictionary.entries import ObjectName, ObjectNames, Rows
-
-CYCLE = 0.001  # s
 
 
 class ObservedDrives(DrivesProxy):

@@ -22,7 +22,7 @@ from drive_env.dictionary.quantities import AxisScale, Scale, integers, is_quant
 from drive_env.drives.arguments import checked_mask, object_names
 from drive_env.drives.emergency import EmergencyMessage
 from drive_env.drives.enabled_check import EnabledCheck
-from drive_env.drives.interface import Drives, machine_of
+from drive_env.drives.interface import CYCLE, Drives, machine_of
 from drive_env.drives.trace import Trace
 from drive_env.emulator.group import call_of, channels, with_cycle
 from drive_env.emulator.inertia_check import warn_of_misfits
@@ -213,7 +213,7 @@ class EmulatedDrives(Saved):
             self.inside.change_rates(device)
             self.faults.change_cycle(longer)
 
-    def record(self, objects: ObjectNames, duration: float, play: Rows = None, period: float = 0.001) -> Trace:
+    def record(self, objects: ObjectNames, duration: float, play: Rows = None, period: float = CYCLE) -> Trace:
         """Let `duration` [s] pass while objects are recorded and played.
 
         Cycle k: row k of `play` is written, then row k is recorded, then one communication cycle passes. In csp and csv

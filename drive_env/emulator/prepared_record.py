@@ -10,15 +10,13 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from drive_env.dictionary.codec import HIGH, LOW, PERIOD, SPECIAL_RAW, SPECIAL_SI, SPECIALS, Code, compiled_rows
 from drive_env.dictionary.entries import ObjectName
 from drive_env.emulator.group import Channels
+from mechanics.arrays import Floats, Integers
 from mechanics.kernels.compiled import cached, stage
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
 
 # Fields that factors depend on: if played, they would change between two rows.
 SCALE_FIELD = "position_scaler"  # increments per revolution

@@ -16,12 +16,9 @@ from numba import types
 from numpy.typing import NDArray
 
 from drive_env.saved_state import Saved
+from mechanics.arrays import Floats, Mask
 from mechanics.kernels.bundle import Bundle, Cube, Matrix, NumberMatrix, Numbers, Vector, reader
 from mechanics.kernels.compiled import cached, inlined, stage
-
-Floats = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 # Marks of a cycle's random numbers; the cycle's number is added.
 _LOST, _ACTION, _OBSERVATION = (k << 40 for k in (1, 2, 3))

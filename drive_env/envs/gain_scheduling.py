@@ -18,7 +18,7 @@ from drive_env.devices.gains import BASELINE_RULE, rule_gains, small_time_consta
 from drive_env.dictionary.roles import Role
 from drive_env.drives import motion
 from drive_env.drives.currents import ampere_per_count
-from drive_env.drives.interface import Drives, device_of
+from drive_env.drives.interface import CYCLE, Drives, device_of
 from drive_env.drives.raw_gains import read_gains, write_gains
 from drive_env.drives.speeds import per_increment
 from drive_env.emulator.emulated_drives import emulated_of
@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     from mechanics.load import Load
 
 
-CYCLE = 0.001  # s, communication cycle
 STEPS = (0.005, 0.020)  # s, shortest and longest time between two sets of gains
 MODES = ("csp", "csv")
 BASES = ("rule", "middle", "present")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from drive_env.drives.interface import CYCLE
 from drive_env.emulator.emulated_drives import emulated_of
 from mechanics.arrays import Floats, Image, Mask
 
@@ -31,7 +32,7 @@ class Pictures:
         OpenGLError: With "human", if there is no display.
     """
 
-    def __init__(self, drives: Drives, mode: str, period: float = 0.001) -> None:
+    def __init__(self, drives: Drives, mode: str, period: float = CYCLE) -> None:
         if drives.machine is None:
             raise ValueError("pictures need emulated machines; leave render_mode out on a bus")
         self._drives = emulated_of(drives)

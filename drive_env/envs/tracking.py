@@ -17,7 +17,7 @@ from drive_env.devices import Device, find_device
 from drive_env.dictionary.roles import Role
 from drive_env.drives import motion
 from drive_env.drives.currents import counts_per_ampere, read_current_limit
-from drive_env.drives.interface import Drives, device_of
+from drive_env.drives.interface import CYCLE, Drives, device_of
 from drive_env.drives.speeds import per_increment
 from drive_env.emulator.cyclic_control import Hooks, cyclic_control
 from drive_env.emulator.emulated_drives import emulated_of
@@ -34,8 +34,6 @@ from drive_env.randomisation.random_machines import Distributions, RandomMachine
 from mechanics.arrays import Floats, Mask, Singles, Texts
 from mechanics.loads import find_load
 from mechanics.shaft import one, way
-
-CYCLE = 0.001  # s, one communication cycle
 
 # Mode -> target object, offset object (CiA 402).
 OBJECTS = {

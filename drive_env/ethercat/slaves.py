@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 
 from drive_env.bus.config import BusConfigError, build_drives, check_seed, store_folder
 from drive_env.devices import find_device
+from drive_env.drives.interface import CYCLE
 from drive_env.ethercat.slave import EtherCatSlave
-from drive_env.ethercat.world import CYCLE, EtherCatWorld
+from drive_env.ethercat.world import EtherCatWorld
 
 if TYPE_CHECKING:
     from drive_env.bus.config import Bus

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from drive_env.drives.interface import CYCLE
 from drive_env.emulator.emulated_drives import EmulatedDrives
 from drive_env.ethercat import datagrams
 from drive_env.ethercat.controller import LOGICAL
 from drive_env.ethercat.segment import Segment
 from drive_env.ethercat.slave import EtherCatSlave
 
-CYCLE = 0.001  # s: the communication cycle
 NANOSECONDS = 1e9  # of a second
 
 

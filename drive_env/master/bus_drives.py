@@ -30,6 +30,7 @@ from drive_env.dictionary.roles import Role
 from drive_env.drives.arguments import checked_mask, object_names, whole_cycles
 from drive_env.drives.emergency import EmergencyMessage
 from drive_env.drives.enabled_check import EnabledCheck
+from drive_env.drives.interface import CYCLE
 from drive_env.drives.limits import Limits
 from drive_env.drives.trace import Trace
 from drive_env.fieldbus.description import Description
@@ -173,7 +174,7 @@ class BusDrives:
             return
         self._cycle_runner.pass_time(cycles, self.safety)
 
-    def record(self, objects: ObjectNames, duration: float, play: Rows = None, period: float = 0.001) -> Trace:
+    def record(self, objects: ObjectNames, duration: float, play: Rows = None, period: float = CYCLE) -> Trace:
         """Let `duration` [s] pass while objects are recorded and played.
 
         In cycle k row k of `play` is sent, then SYNC, at which the drives apply it and sample row k of `objects`.

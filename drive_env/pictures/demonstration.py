@@ -15,6 +15,7 @@ from drive_env import cia402
 from drive_env.default_device import DEFAULT_DEVICE
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.drives import motion
+from drive_env.drives.interface import CYCLE
 from mechanics.arrays import Floats
 from mechanics.reading.untrusted import read_toml
 
@@ -157,7 +158,7 @@ def _drive(recorder: Recorder, row: Demonstration, setpoints: list[Floats], torq
         else:
             drives.write(target, raw)
         if row.mode in ("pp", "pv"):
-            recorder.advance(motion.STEP)  # bit 10 falls in the cycle after the set-point
+            recorder.advance(CYCLE)  # bit 10 falls in the cycle after the set-point
             motion.wait_for(recorder, cia402.TARGET_REACHED, row.longest, f"set-point {k}")
         recorder.advance(row.hold)
         tell((1.0 + k) / steps)

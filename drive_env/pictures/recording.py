@@ -15,6 +15,7 @@ from drive_env.dictionary import units
 from drive_env.dictionary.codec import decode, encode
 from drive_env.dictionary.entries import ObjectName
 from drive_env.dictionary.roles import Role
+from drive_env.drives.interface import CYCLE
 from mechanics.arrays import Floats, Integers, Mask
 
 if TYPE_CHECKING:
@@ -33,7 +34,6 @@ _RECORDED = (POSITION_DEMAND, POSITION, VELOCITY, CURRENT, TARGET_VELOCITY, TARG
 _OF_TORQUE = (CURRENT, TARGET_CURRENT)  # which drives in open loop have not
 _PROFILED_MODES = (1, 3, 8)  # pp, pv, csp: 6062h goes on in them, and its slope is the velocity demand
 _CSV, _CST = 9, 10
-CYCLE = 0.001  # s between two samples
 
 
 class Recording(NamedTuple):

@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from drive_env.drives.interface import CYCLE
 from drive_env.pictures.demonstration import PictureFormat
 from drive_env.pictures.opengl import OpenGLError, has_display, import_mujoco
 from drive_env.pictures.picture_files import check_out, write_film
-from drive_env.pictures.recording import CYCLE
 from drive_env.pictures.scene import Scene
 from drive_env.pictures.scope_picture import ScopePicture
 from mechanics.arrays import Floats, Image

@@ -6,10 +6,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from drive_env.drives.interface import CYCLE
 from drive_env.faults.schedule import Order
 from drive_env.faults.table import FAULTS
 
-CYCLE = 0.001  # s: faults begin and end at communication cycles
 Range = tuple[float, float]
 
 

@@ -21,7 +21,7 @@ from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.roles import Role
 from drive_env.drives.arguments import object_names, whole_cycles
 from drive_env.drives.drives_proxy import DrivesProxy
-from drive_env.drives.interface import Drives
+from drive_env.drives.interface import CYCLE, Drives
 from drive_env.drives.trace import Trace
 from drive_env.safety.errors import SafetyError
 from drive_env.studio.errors import JobStoppedError
@@ -143,7 +143,7 @@ class SharedDrives(DrivesProxy):
         objects: ObjectName | Sequence[ObjectName],
         duration: float,
         play: Mapping[Any, ArrayLike] | None = None,
-        period: float = 0.001,
+        period: float = CYCLE,
     ) -> Trace:
         """Let time pass [s] while objects are recorded and played, as `Drives.record`, also to the recorder."""
         if play:

@@ -19,14 +19,14 @@ from drive_env.devices import Device
 from drive_env.devices.gain_set import ClosedLoop
 from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count
-from drive_env.drives.interface import Drives, device_of
+from drive_env.drives.interface import CYCLE, Drives, device_of
 from drive_env.drives.raw_gains import read_gains, write_gains
 from drive_env.motors import Motor
 from drive_env.phase_current import amplitude, holding_torque, rated_setting, run_and_standby
 from drive_env.trials.gain_trial import PHASES, Identified, Trials
 from drive_env.trials.open_loop import OPEN, TOOTH, OpenLoopTrials, with_run_current
 from drive_env.trials.oscillation import OSCILLATION
-from drive_env.trials.positioning import CYCLE, PROFILE, TRAVEL_SHARE, TRIAL, Move, move_terms, wrapped, write_profile
+from drive_env.trials.positioning import PROFILE, TRAVEL_SHARE, TRIAL, Move, move_terms, wrapped, write_profile
 from drive_env.trials.score import Terms, cost
 from mechanics.arrays import Floats, Integers, Mask
 

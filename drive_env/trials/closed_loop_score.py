@@ -16,9 +16,10 @@ from drive_env import cia402
 from drive_env.devices.gain_set import LOAD_ANGLE
 from drive_env.dictionary.entries import ObjectName
 from drive_env.dictionary.roles import Role
+from drive_env.drives.interface import CYCLE
 from drive_env.trials.closed_loop import CLOSING, OVERLOAD, full_step, held_in_trial
 from drive_env.trials.open_loop import ENCODER, NO_WINDOW, with_run_current
-from drive_env.trials.positioning import CYCLE, SETTLED, TRIAL, Move, power_up
+from drive_env.trials.positioning import SETTLED, TRIAL, Move, power_up
 from drive_env.trials.score import LOAD_SHARE, StepperScore
 from mechanics.arrays import Floats, Integers, Mask
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from drive_env import cia402
-from drive_env.drives.interface import Drives
-from drive_env.trials.positioning import CYCLE, Move
+from drive_env.drives.interface import CYCLE, Drives
+from drive_env.trials.positioning import Move
 from mechanics.arrays import Floats, Integers
 
 COMPUTED = (

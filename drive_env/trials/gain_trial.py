@@ -16,7 +16,7 @@ from drive_env.devices.gain_set import GainSet
 from drive_env.dictionary.roles import Role
 from drive_env.drives import motion
 from drive_env.drives.currents import ampere_per_count
-from drive_env.drives.interface import Drives, device_of
+from drive_env.drives.interface import CYCLE, Drives, device_of
 from drive_env.drives.raw_gains import write_gains
 from drive_env.drives.speeds import per_increment
 from drive_env.motors import Motor
@@ -24,7 +24,6 @@ from drive_env.saved_state import Saved
 from drive_env.trials.demand import computed, is_recorded
 from drive_env.trials.oscillation import shakes
 from drive_env.trials.positioning import (
-    CYCLE,
     TRIAL,
     WATCH,
     Move,

@@ -19,7 +19,7 @@ from drive_env.devices import Device
 from drive_env.devices.gain_set import RUN
 from drive_env.dictionary.roles import Role
 from drive_env.drives import motion
-from drive_env.drives.interface import Drives, axis_number, device_of
+from drive_env.drives.interface import CYCLE, Drives, axis_number, device_of
 from drive_env.drives.raw_gains import read_gains, write_gains
 from drive_env.drives.speeds import per_increment
 from drive_env.motors import Motor
@@ -29,7 +29,6 @@ from drive_env.trials.positioning import (
     ACCELERATION_SHARE,
     BAND,
     BAND_COUNTS,
-    CYCLE,
     PROFILE,
     SETTLED,
     TRIAL,

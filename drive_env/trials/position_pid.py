@@ -19,7 +19,7 @@ from drive_env import cia402
 from drive_env.devices import Device
 from drive_env.devices.gain_set import PID_ALONE, ClosedLoop
 from drive_env.dictionary.roles import Role
-from drive_env.drives.interface import device_of
+from drive_env.drives.interface import CYCLE, device_of
 from drive_env.motors import Motor
 from drive_env.phase_current import holding_torque
 from drive_env.trials.closed_loop import ClosedLoopTrials, full_step
@@ -27,7 +27,6 @@ from drive_env.trials.gain_trial import Identified
 from drive_env.trials.open_loop import LOST, TOOTH, open_loop_terms
 from drive_env.trials.positioning import (
     BAND_COUNTS,
-    CYCLE,
     QUIET,
     SETTLED,
     TRAVEL_SHARE,

@@ -16,7 +16,7 @@ from drive_env import cia402
 from drive_env.devices import Device
 from drive_env.dictionary.units import split_unit
 from drive_env.drives import motion
-from drive_env.drives.interface import Drives
+from drive_env.drives.interface import CYCLE, Drives
 from drive_env.drives.speeds import per_increment
 from drive_env.motors import Motor
 from mechanics.arrays import Floats, Integers, Mask
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from mechanics.load import Load
 
 
-CYCLE = 0.001  # s
 # In communication cycles: the profile, the end of the window in which it settles, and the trial.
 PROFILE, SETTLED, TRIAL = 60, 150, 250
 QUIET = (PROFILE + SETTLED) // 2  # first cycle of the window for the ripple

@@ -19,8 +19,8 @@ import numpy as np
 from drive_env import cia402
 from drive_env.cia402 import Key
 from drive_env.drives import motion
+from drive_env.drives.interface import CYCLE
 from drive_env.randomisation.random_machines import BESIDE, Distributions, Law
-from drive_env.trials.positioning import CYCLE
 from mechanics.arrays import Floats, Integers, Mask
 from mechanics.reading.near_names import did_you_mean
 from mechanics.reading.untrusted import read_rows

@@ -45,6 +45,7 @@ from drive_env import cia402
 from drive_env.devices.gains import has_linear_model, small_time_constants
 from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count
+from drive_env.drives.interface import CYCLE
 from drive_env.drives.raw_gains import write_gains
 from drive_env.emulator.parameters import WIRING
 from drive_env.loops.dynamics import DEFAULT, INERTIA_RANGE, Dynamics, find_dynamics, loop_clearance
@@ -53,7 +54,6 @@ from drive_env.loops.true_plant import elastic_lags, true_machines
 from drive_env.phase_current import swing_period
 from drive_env.saved_state import Saved
 from drive_env.trials.positioning import (
-    CYCLE,
     SETTLED,
     TRIAL,
     Move,

@@ -16,10 +16,10 @@ import numpy as np
 
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
-from drive_env.drives.interface import Drives
+from drive_env.drives.interface import CYCLE, Drives
 from drive_env.motors import Motor
 from drive_env.trials.open_loop import LOST, TOOTH, OpenLoopTrials
-from drive_env.trials.positioning import CYCLE, Move, wrapped, write_profile
+from drive_env.trials.positioning import Move, wrapped, write_profile
 from mechanics.arrays import Floats, Integers, Mask
 
 SAMPLE = 4 * CYCLE  # s between two samples

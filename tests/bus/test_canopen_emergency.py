@@ -10,7 +10,6 @@ from drive_env import EmulatedDrives
 from drive_env.canopen.emergency import QUEUE
 from drive_env.canopen.nmt import NmtState
 from drive_env.devices import find_device
-from drive_env.firmware.common import fsa
 from drive_env.firmware.servo.causes import CAUSES
 from drive_env.node.error_history import CONDITIONS
 
@@ -25,45 +24,6 @@ def wire(drives):
 
 def test_every_cause_and_condition_has_a_row_in_the_device():
     assert set(find_device("tmcm1636").emergencies) == {cause.name for cause in CAUSES} | set(CONDITIONS)
-
-
-def test_a_fault_and_its_reset(wire):
-    wire.enable()
-    wire.drives.machine.enable_input = False
-    wire.play("""
-        wait 1 ms
-        tx 085  41 54 81 00 FF 00 00 00   # shutdown switch; generic and manufacturer-specific
-        rx 605  40 01 10 00 00 00 00 00
-        tx 585  4F 01 10 00 81 00 00 00
-        wait 50 ms                        # once
-    """)
-    wire.drives.machine.enable_input = True
-    wire.play("""
-        wait 1 ms
-        rx 605  2B 40 60 00 80 00 00 00
-        tx 585  60 40 60 00 00 00 00 00
-        wait 1 ms
-        tx 085  00 00 00 00 00 00 00 00   # error reset
-        rx 605  40 01 10 00 00 00 00 00
-        tx 585  4F 01 10 00 00 00 00 00
-    """)
-
-
-def test_the_register_of_a_message_is_that_of_its_moment(wire):
-    wire.start()
-    wire.play("""
-        rx 305  00 00 02                  # 6320h
-        tx 085  20 63 21 00 FF 00 00 00
-        rx 205  00                        # and the bits of both
-        tx 085  10 82 31 00 FF 00 00 00
-        rx 205  00 00
-        rx 605  40 01 10 00 00 00 00 00
-        tx 585  4F 01 10 00 21 00 00 00
-        rx 000  82 05                     # reset communication forgets
-        tx 705  00
-        rx 605  40 01 10 00 00 00 00 00
-        tx 585  4F 01 10 00 00 00 00 00
-    """)
 
 
 def test_a_fault_reset_ends_conditions_of_the_bus(wire):
@@ -111,16 +71,6 @@ def test_stopped_tells_later(wire):
     """)
 
 
-@pytest.mark.parametrize(("buffer", "extra"), [("controller", "01"), ("transmit", "02"), ("receive", "03")])
-def test_overruns(wire, buffer, extra):
-    wire.node.overrun(wire.now, buffer)
-    assert [str(f) for f in wire.take()] == [f"085  10 81 11 {extra} FF 00 00 00"]
-    wire.node.overrun(wire.now, buffer)
-    assert len(wire.take()) == 1, "each is an event"
-    assert wire.value(0x1001) == 0, "it is over when told"
-
-
-# How each condition of the bus comes about, and how it ends by itself: by another frame, or it is over when it is told.
 def test_0000h_waits_until_all_errors_are_gone(wire):
     wire.start()
     wire.play("""
@@ -151,23 +101,6 @@ def test_an_error_that_nobody_was_told_of_has_no_end(wire):
 
 
 # --- bus-off ----------------------------------------------------------------------------------------------------------
-def test_bus_off_stops_the_drive_and_is_told_after_recovery(wire):
-    assert wire.download(0x1029, 1, 1, 1) == 0  # stay operational
-    assert wire.download(0x1017, 0, 10, 2) == 0
-    wire.enable()
-    wire.start()
-    wire.node.bus_off(wire.now)
-    wire.play("""
-        rx 605  40 41 60 00 00 00 00 00   # nothing comes, nothing goes
-        rx 000  81 05
-        wait 20 ms
-    """)
-    assert wire.node._axes[0].state == fsa.State.FAULT
-    assert wire.node.state is NmtState.OPERATIONAL
-    wire.node.bus_on(wire.now)
-    assert str(wire.take()[0]) == "085  40 81 11 00 FF 00 00 00"
-    wire.wait(1)
-    assert {frame.can_id for frame in wire.take()} == {0x185, 0x285, 0x705}
 
 
 @pytest.mark.slow

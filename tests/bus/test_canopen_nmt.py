@@ -89,27 +89,6 @@ def test_a_moving_axis_brakes_on_the_quick_stop_ramp_when_stopped(wire):
     assert abs(wire.drives.read(0x606C)[0]) < 20_000
 
 
-def test_reset_communication_restores_1000h_to_1fffh_alone(wire):
-    wire.enable()
-    assert wire.download(0x6081, 0, 4711, 4) == 0
-    assert wire.download(0x1017, 0, 4000, 2) == 0
-    assert wire.download(0x2705, 0, 9, 1) == 0
-    assert wire.download(0x1400, 2, 0, 1) == 0
-    wire.play("""
-        rx 000  82 05
-        tx 705  00
-        rx 605  40 17 10 00 00 00 00 00
-        tx 585  4B 17 10 00 00 00 00 00
-        rx 605  40 00 14 02 00 00 00 00
-        tx 585  4F 00 14 02 FF 00 00 00
-        rx 605  40 81 60 00 00 00 00 00
-        tx 585  43 81 60 00 67 12 00 00
-        rx 605  40 05 27 00 00 00 00 00   # 2704h and 2705h lie outside: reset the module
-        tx 585  4F 05 27 00 09 00 00 00
-    """)
-    assert wire.value(0x6041) & 0x6F == 0x27, "the drive goes on"
-
-
 def test_the_boot_loader_speaks_no_canopen(wire):
     wire.enable()
     wire.play("""

@@ -14,12 +14,10 @@ from rigs.canopen_wire import Wire
 
 from drive_env import EmulatedDrives
 from drive_env.canopen.node import Node
-from drive_env.devices import find_device
 from drive_env.node import store
 
 SAVE, LOAD = "73 61 76 65", "6C 6F 61 64"
 STORE_FILE = Path(store.__file__)
-DEVICE = find_device("tmcm1636")
 
 
 @pytest.fixture
@@ -45,17 +43,6 @@ PARAMETERS = {
     "motor 0": (0x2003, 0, 4, 815),
     "bus": (0x2704, 0, 2, 500),
 }
-
-
-def test_restoring_everything_takes_the_drive_to_its_factory_values(wire):
-    assert wire.value(0x2050) == 3, "the emulator comes commissioned"
-    assert wire.download(0x1011, 1, 0x64616F6C, 4) == 0
-    power_cycled(wire)
-    factory = DEVICE.new_dictionary(1)  # the factory's node ID
-    assert wire.node.node_id == 1
-    for entry in factory:
-        if entry.access == "rw":
-            assert wire.value(entry.index, entry.sub) == entry.default, entry.label
 
 
 def test_reset_communication_brings_stored_communication_parameters_alone(wire):
@@ -146,12 +133,6 @@ def test_2706h_stores_nothing_else(wire):
     assert wire.download(0x2706, 0, 0x65766173, 4) == 0
     power_cycled(wire)
     assert (wire.value(0x6081), wire.value(0x1017)) == (before, 0)
-
-
-def test_what_is_not_stored_is_lost(wire):
-    assert wire.download(0x2705, 0, 33, 1) == 0
-    wire.play("rx 000  81 05\ntx 705  00")
-    assert (wire.value(0x2705), wire.value(0x2708)) == (5, 5)
 
 
 def test_a_stored_identifier_of_its_own_stays_while_others_follow_the_node_id(wire):

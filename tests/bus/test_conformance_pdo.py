@@ -99,6 +99,7 @@ def test_the_pdos_of_an_axis_map_its_own_objects(facts):
             axes = {facts.axis_of(entry.index) for entry in facts.mapped(index)} - {None}
             assert len(axes) == 1, f"{index:04X}h"
             assert not step or axes == {(index - indices[0]) // step}
+            assert all(entry.travels(index in facts.tpdos) for entry in facts.mapped(index)), f"{index:04X}h"
 
 
 # --- received ---------------------------------------------------------------------------------------------------------

@@ -9,10 +9,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from rigs.quirks import build, variant
-from rigs.world_bus import WorldBus
+from rigs.world_bus import on_bus
 
-from drive_env import CanDrives, motion
-from drive_env.bus.world import World
+from drive_env import motion
 from drive_env.devices import find_device
 from drive_env.devices.drive_quirks import DriveQuirks
 
@@ -279,18 +278,10 @@ BY_DEFAULT = ("same mode refused", "all")
     "name", [name if name in BY_DEFAULT else pytest.param(name, marks=pytest.mark.slow) for name in QUIRKS]
 )
 def test_a_master_that_knows_the_eds_alone_copes_with_each(tmp_path, name):
-    world = World(lockstep=True)
-    drives = build(tmp_path, **QUIRKS[name])
-    world.add(drives, [1])
-    bus = WorldBus(world)
     path = tmp_path / "vendor.eds"
     path.write_text(find_device("tmcm1636").eds.read_text(encoding="utf-8"), encoding="utf-8")
-    try:
-        with CanDrives(eds=path, bus=bus, pace="lockstep") as known_by_eds:
-            life(known_by_eds)
-    finally:
-        bus.shutdown()
-        world.close()
+    with on_bus(build(tmp_path, **QUIRKS[name]), eds=path) as known_by_eds:
+        life(known_by_eds)
 
 
 @pytest.mark.slow

@@ -5,7 +5,6 @@ from __future__ import annotations
 import configparser
 
 import canopen
-import pytest
 from canopen.objectdictionary import ODArray, ODRecord, ODVariable, datatypes
 from rigs import ROOT
 from rigs.tables import every_row
@@ -361,25 +360,6 @@ def test_sub_index_0_is_the_largest_sub_index():
             assert subs[0].default == max(subs)
 
 
-@pytest.mark.parametrize("index", MAPPINGS, ids=[f"{index:04X}" for index in MAPPINGS])
-def test_default_mapping_points_at_mappable_objects_of_that_length(index):
-    record = OD[index].subindices
-    total = 0
-    for sub in range(1, record[0].max + 1):
-        mapping = record[sub].default
-        if sub > record[0].default:
-            assert mapping == 0
-            continue
-        mapped = entry(OD, mapping >> 16, mapping >> 8 & 0xFF)
-        assert mapped.pdo_mappable
-        assert len(mapped) == mapping & 0xFF
-        if index < 0x1800:
-            assert mapped.writable
-        assert mapped.readable
-        total += len(mapped)
-    assert 0 < total <= 64
-
-
 def test_cob_ids_follow_the_node_id():
     cob_ids = [(0x1014, 0)] + [(index + k, 1) for index in (0x1400, 0x1800) for k in range(4)]
     other = read(NODE + 1)
@@ -390,12 +370,6 @@ def test_cob_ids_follow_the_node_id():
         if a.default != b.default
     ]
     assert follow == moved == cob_ids
-
-
-def test_top_level_names_are_unique_whatever_their_case():
-    names = [obj.name.casefold() for obj in OD.values()]
-    assert len(names) == len(set(names))
-    assert not any("." in name for name in names)  # python-canopen splits "record.entry" there
 
 
 def test_every_section_has_the_keys_of_its_kind():

@@ -17,12 +17,11 @@ import numpy as np
 import pytest
 from rigs import TESTS
 from rigs.life import Life
-from rigs.world_bus import WorldBus
+from rigs.world_bus import on_bus
 from typer.testing import CliRunner
 
 from agents.tuner.tune_target import gains_for, surrogate
-from drive_env import CanDrives, EmulatedDrives, motion
-from drive_env.bus.world import World
+from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
 from drive_env.devices.gains import check_linear_model, loop_scales, rule_gains
 from drive_env.dictionary.access import ObjectAccessError
@@ -291,14 +290,9 @@ def test_on_a_bus_both_axes_of_a_node_show_the_same_integers():
     machine = {"load": "inertia", "num_machines": 2, "num_threads": 1, "seed": 4}
     with EmulatedDrives(INVENTED, **machine) as inside:
         expected = moved(inside)
-    world = World(lockstep=True)
-    world.add(EmulatedDrives(INVENTED, **machine), [1])
-    bus = WorldBus(world)
-    with CanDrives(INVENTED, bus=bus, nodes=(1,), pace="lockstep") as drives:
+    with on_bus(EmulatedDrives(INVENTED, **machine), device=INVENTED) as drives:
         assert drives.num_axes == 2
         found = moved(drives)
-    bus.shutdown()
-    world.close()
     np.testing.assert_array_equal(found, expected)
 
 

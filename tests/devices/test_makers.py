@@ -10,7 +10,7 @@ from rigs.canopen_wire import Wire
 from rigs.makers import files
 from rigs.pump import NODE
 from rigs.small_eds import entry
-from rigs.world_bus import WorldBus
+from rigs.world_bus import bus_of
 from typer.testing import CliRunner
 
 from drive_env import CanDrives, EmulatedDrives, Limits, motion
@@ -59,15 +59,11 @@ def emulated(device, **options):
 @contextmanager
 def mastered(path, device, **options):
     """Our master, which knows the maker's file alone, and the drive at the other end of its bus in lockstep."""
-    world = World(lockstep=True)
-    world.add(emulated(device), [NODE])
-    bus = WorldBus(world)
-    try:
-        with CanDrives(eds=path, bus=bus, nodes=(NODE,), pace="lockstep", **options) as drives:
-            yield drives, bus
-    finally:
-        bus.shutdown()
-        world.close()
+    with (
+        bus_of(emulated(device), (NODE,)) as bus,
+        CanDrives(eds=path, bus=bus, nodes=(NODE,), pace="lockstep", **options) as drives,
+    ):
+        yield drives, bus
 
 
 # --- limits within which an object cannot say "no limit" --------------------------------------------------------------

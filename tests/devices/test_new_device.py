@@ -23,11 +23,10 @@ from rigs.canopen_wire import Wire
 from rigs.makers import files
 from rigs.pump import NODE, PATIENCE, BootUps, Pump, until
 from rigs.small_eds import FOLDER, entry, put
-from rigs.world_bus import WorldBus
+from rigs.world_bus import bus_of
 from typer.testing import CliRunner
 
 from drive_env import CanDrives, EmulatedDrives, cia402, motion
-from drive_env.bus.world import World
 from drive_env.canopen.frames import Frame
 from drive_env.commands.cli import app
 from drive_env.devices import find_device
@@ -164,14 +163,8 @@ def test_each_becomes_a_drive_that_lives(folders, name):
 @contextmanager
 def on_a_bus(folder):
     """A bus in lockstep with an emulated drive of a folder as node 5, and options of a master's."""
-    world = World(lockstep=True)
-    world.add(emulated(folder), [NODE])
-    bus = WorldBus(world)
-    try:
+    with bus_of(emulated(folder), (NODE,)) as bus:
         yield {"bus": bus, "nodes": (NODE,), "pace": "lockstep"}
-    finally:
-        bus.shutdown()
-        world.close()
 
 
 @pytest.mark.every(10)
@@ -492,20 +485,14 @@ def units_of(made):
 def test_a_drive_without_1005h_is_served_and_takes_sync_as_080h(tmp_path):
     made, told = made_of(tmp_path, without(BASE, "1005"))
     assert told["1005h"] == "the EDS has none: SYNC is taken as 080h, as CiA 301 has it"
-    world = World(lockstep=True)
-    world.add(emulated(str(made.folder)), [NODE])
-    bus = WorldBus(world)
-    try:
-        with CanDrives(str(made.folder), bus=bus, nodes=(NODE,), pace="lockstep", safety=False) as drives:
-            motion.enable(drives, mode="csp")
-            here = drives.read(0x6064)
-            way = (1000 * np.linspace(0.0, 1.0, 200)).astype(int)
-            drives.record([0x6064], 0.2, play={0x607A: here + way[:, None]})
-            drives.advance(0.3)
-            assert np.all(np.abs(drives.read(0x6064) - here - 1000) < 100)
-    finally:
-        bus.shutdown()
-        world.close()
+    folder = str(made.folder)
+    with on_a_bus(folder) as options, CanDrives(folder, safety=False, **options) as drives:
+        motion.enable(drives, mode="csp")
+        here = drives.read(0x6064)
+        way = (1000 * np.linspace(0.0, 1.0, 200)).astype(int)
+        drives.record([0x6064], 0.2, play={0x607A: here + way[:, None]})
+        drives.advance(0.3)
+        assert np.all(np.abs(drives.read(0x6064) - here - 1000) < 100)
 
 
 @pytest.mark.parametrize(
@@ -902,21 +889,14 @@ def test_eds_and_dcf_have_the_commissioned_values_and_python_canopen_reads_them(
 
 def test_a_drive_on_a_bus_is_exported_as_it_is(folders, tmp_path, monkeypatch):
     folder, source = str(folders["fjord_ft2"].folder), FOLDER / "fjord_ft2.eds"
-    world = World(lockstep=True)
-    world.add(emulated(folder), [NODE])
-    bus = WorldBus(world)
-    try:
-        with CanDrives(eds=source, bus=bus, nodes=(NODE,), pace="lockstep", safety=False) as drives:
+    with on_a_bus(folder) as options:
+        opened = lambda *_, **__: CanDrives(eds=source, safety=False, **options)  # noqa: E731
+        with opened() as drives:
             drives.write(0x6081, [1111, 2222])
             values = commissioned_values(drives)
-        again = {"bus": bus, "nodes": (NODE,), "pace": "lockstep", "safety": False}
-        opened = lambda *_, **__: CanDrives(eds=source, **again)  # noqa: E731
         monkeypatch.setattr("drive_env.commands.options.BusOptions.connect", opened)
         done = run("export", "eds", tmp_path / "named.eds", "--eds", source, "--node", NODE)
         assert done.stdout.endswith(f"{len(values)} parameters of {source.stem}\n"), done.output
-    finally:
-        bus.shutdown()
-        world.close()
     assert (values[0x6081, 0], values[0x6881, 0]) == (1111, 2222)
     assert (0x607A, 0) not in values and (0x6040, 0) not in values  # a set-point, a command
     path = tmp_path / "two.dcf"

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from rigs.canopen_wire import Wire
-from rigs.world_bus import WorldBus
+from rigs.world_bus import on_bus
 
-from drive_env import CanDrives, EmulatedDrives, Limits, ObjectAccessError, motion
-from drive_env.bus.world import World
+from drive_env import EmulatedDrives, Limits, ObjectAccessError, motion
 from drive_env.dictionary.position_scale import position_scale
 from drive_env.dictionary.roles import Role
 from drive_env.safety.errors import SafetyError
@@ -74,11 +73,8 @@ def test_neither_object_is_played(drives):
 
 
 def test_a_master_reads_it_and_its_limits_stay_with_the_rotor():
-    world = World(lockstep=True)
-    world.add(EmulatedDrives(MODULE, load="inertia", num_machines=AXES, num_threads=1), [1])
-    bus = WorldBus(world)
-    limits = Limits(position=(-51200, 51200))
-    with CanDrives(MODULE, bus=bus, pace="lockstep", safety=limits) as drives:
+    emulated = EmulatedDrives(MODULE, load="inertia", num_machines=AXES, num_threads=1)
+    with on_bus(emulated, device=MODULE, safety=Limits(position=(-51200, 51200))) as drives:
         assert scale_objects(drives.description) == ((FULL_STEPS, 0), (MICROSTEPS, 0))
         assert drives.read(Role.POSITION_SCALE).tolist() == [51200] * AXES
         drives.write(MICROSTEPS, 4)
@@ -89,8 +85,6 @@ def test_a_master_reads_it_and_its_limits_stay_with_the_rotor():
         with pytest.raises(SafetyError, match="would lead to 3201, beyond the limits -3200 to 3200"):
             drives.write(0x607A, 3201)
         motion.disable(drives)
-    bus.shutdown()
-    world.close()
 
 
 def test_a_port_that_has_read_before_follows_a_scale_that_changes():

@@ -39,7 +39,7 @@ from rigs.fault_injection import (
     until,
     worst_of,
 )
-from rigs.world_bus import assert_equal
+from rigs.world_bus import assert_equal, on_bus
 
 from drive_env import CanDrives, EmulatedDrives, ObjectAccessError, SafetyError, cia402, motion
 from drive_env.canopen.frames import Frame
@@ -78,12 +78,8 @@ def no_test_hangs(request):
 @contextmanager
 def lockstep(inside, safety=True):
     inside.machine.reset()
-    bus = WorldBus(ObservedWorld(inside, lockstep=True))
-    try:
-        with CanDrives("tgz_d", bus=bus, pace="lockstep", timeout=ANSWER, safety=safety) as drives:
-            yield drives
-    finally:
-        bus.shutdown()
+    with on_bus(inside, stay=True, timeout=ANSWER, safety=safety) as drives:
+        yield drives
 
 
 def turn(drives):

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rigs.stepper_scenes import Scene, label
+from rigs.stepper_scenes import Scene, check_acts_on_one_axis, check_every_object_is_varied, label
 
 from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
@@ -198,10 +198,6 @@ ELSEWHERE = {
 }
 
 
-def keys():
-    return {name if isinstance(name, tuple) else (name, 0) for name in ROWS}
-
-
 def vary(name, scene, one, other, axis=0):
     """Return what a scene shows with one value of an object, and with another on an axis."""
     found = []
@@ -221,11 +217,7 @@ def vary(name, scene, one, other, axis=0):
 
 def acts_on_one_axis(name, axis):
     scene, one, other = ROWS[name]
-    first, second = vary(name, scene, one, other, axis)
-    assert np.isfinite(first).all() and np.isfinite(second).all()
-    differs = [not np.array_equal(first[:, k], second[:, k]) for k in range(2)]
-    assert differs[axis], f"{one} and {other} are the same to this drive"
-    assert sum(differs) == 1, f"axis {axis} alone has another value: {differs}"
+    check_acts_on_one_axis(*vary(name, scene, one, other, axis), axis)
 
 
 @pytest.mark.slow  # some 90 lives of a drive
@@ -240,17 +232,8 @@ def test_so_it_is_on_the_second_axis(name):
 
 
 def test_every_writable_object_of_an_axis_is_varied():
-    """Those of communication (1000h to 1FFFh) have their own tests; nothing of an axis is refused."""
-    writable = {
-        (entry.index, entry.sub)
-        for entry in DEVICE.new_dictionary()
-        if entry.access in ("rw", "rww", "wo")
-        and entry.index >= 0x2000
-        and DEVICE.locate(entry.index)[1] == entry.index
-    }
-    idle = writable & DEVICE.without_effect.keys()
-    assert writable == keys() | set(ELSEWHERE) | idle
-    assert not keys() & set(ELSEWHERE) and not idle & (keys() | set(ELSEWHERE))
+    """And none of an axis is refused."""
+    check_every_object_is_varied(DEVICE, ROWS, ELSEWHERE, DEVICE.without_effect)
     assert not {key for key in DEVICE.unsupported if key[0] >= 0x2000}
 
 

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from rigs.canopen_wire import Wire
 from rigs.coe_rig import CoeRig
-from rigs.fault_injection import ANSWER, ObservedWorld, WorldBus
+from rigs.fault_injection import ANSWER
 from rigs.tgz_images import select
 from rigs.truth import field
+from rigs.world_bus import bus_of, on_bus
 
 from drive_env import CanDrives, EmulatedDrives, Limits, SafetyError, cia402, motion
 from drive_env.ethercat.application import AlState
@@ -351,22 +352,17 @@ def test_while_the_master_is_connected_k_command_does_nothing(drives):
 @pytest.mark.parametrize(("name", "raw"), [("K-Command", 1), (0x23C8, 2)])
 def test_a_program_with_limits_enables_by_neither(drives, name, raw):
     drives.machine.reset()
-    bus = WorldBus(ObservedWorld(drives, lockstep=True))
-    try:
-        with CanDrives("tgz_d", bus=bus, pace="lockstep", timeout=ANSWER) as master:
-            with pytest.raises(SafetyError, match=r"enables a motor beside the controlword.*Enable by 6040h"):
-                master.write(name, raw)
-            master.write(name, 0)
-    finally:
-        bus.shutdown()
+    with on_bus(drives, stay=True, timeout=ANSWER) as master:
+        with pytest.raises(SafetyError, match=r"enables a motor beside the controlword.*Enable by 6040h"):
+            master.write(name, raw)
+        master.write(name, 0)
 
 
 @pytest.mark.parametrize("name", ["M-Inull", "M-Ipeak"])
 def test_a_limit_of_current_is_not_raised_by_what_its_counts_are(drives, name):
     """Limits of a TGZ are parts of the motor's currents: with greater ones the drive would give more ampere."""
     drives.machine.reset()
-    bus = WorldBus(ObservedWorld(drives, lockstep=True))
-    try:
+    with bus_of(drives, [1], stay=True) as bus:
         with CanDrives("tgz_d", bus=bus, pace="lockstep", timeout=ANSWER, safety=Limits(current=8000)) as master:
             motion.enable(master, mode="pv")
             master.advance(0.002)
@@ -384,31 +380,25 @@ def test_a_limit_of_current_is_not_raised_by_what_its_counts_are(drives, name):
                 master.write(name, 60_000)
             motion.disable(master)
             master.write(name, 60_000)  # a motor is commissioned so
-    finally:
-        bus.shutdown()
 
 
 def test_speeds_ramps_and_counts_change_past_the_limits_by_no_register_of_an_enabled_axis(drives):
     """PosSpeed and Speed are 6081h and 60FFh in other units: what they had before is refused as the move begins."""
     drives.machine.reset()
-    bus = WorldBus(ObservedWorld(drives, lockstep=True))
-    try:
-        with CanDrives("tgz_d", bus=bus, pace="lockstep", timeout=ANSWER, safety=Limits(velocity=10_000)) as master:
-            master.write("PG PosSpeed", 100 * 2**16)
-            motion.enable(master, mode="pp")
-            with pytest.raises(SafetyError, match=r"its drive has 6081h:00 .* beyond the limit 10000"):
-                motion.start_move(master, UNITS)
-            for register in (
-                *(f"PG {name}" for name in ("Acc", "Dec", "PosSpeed", "Speed", "BitsPerRevol")),
-                "F-Type", "F-Resolution", "F-IncrEnc", "M-Polepairs", "M-CommutOffset",
-            ):  # fmt: skip
-                now = master.read(register)
-                with pytest.raises(SafetyError, match=r"past the checked objects of CiA 402.*Disable it first"):
-                    master.write(register, now)
-            motion.disable(master)
-            master.write("PG PosSpeed", 2**16)
-    finally:
-        bus.shutdown()
+    with on_bus(drives, stay=True, timeout=ANSWER, safety=Limits(velocity=10_000)) as master:
+        master.write("PG PosSpeed", 100 * 2**16)
+        motion.enable(master, mode="pp")
+        with pytest.raises(SafetyError, match=r"its drive has 6081h:00 .* beyond the limit 10000"):
+            motion.start_move(master, UNITS)
+        for register in (
+            *(f"PG {name}" for name in ("Acc", "Dec", "PosSpeed", "Speed", "BitsPerRevol")),
+            "F-Type", "F-Resolution", "F-IncrEnc", "M-Polepairs", "M-CommutOffset",
+        ):  # fmt: skip
+            now = master.read(register)
+            with pytest.raises(SafetyError, match=r"past the checked objects of CiA 402.*Disable it first"):
+                master.write(register, now)
+        motion.disable(master)
+        master.write("PG PosSpeed", 2**16)
 
 
 def test_outputs_are_forced_and_set_by_the_axis_own_registers():

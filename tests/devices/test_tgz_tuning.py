@@ -7,10 +7,10 @@ from dataclasses import replace
 import gymnasium
 import numpy as np
 import pytest
-from rigs.fault_injection import ObservedWorld, eds_read_once
-from rigs.world_bus import WorldBus
+from rigs.fault_injection import eds_read_once
+from rigs.world_bus import on_bus
 
-from drive_env import CanDrives, EmulatedDrives, Limits, cia402, motion
+from drive_env import EmulatedDrives, Limits, cia402, motion
 from drive_env.devices import find_device
 from drive_env.drives.currents import ampere_per_count, to_counts
 from drive_env.motors import find_motor
@@ -38,14 +38,12 @@ def test_the_current_of_identification_is_one_that_the_envelope_lets_pass(rated)
     """The limit counts thousandths of the nominal current, 6071h 32767ths of the peak current: neither rounds up."""
     with EmulatedDrives("tgz_d", "inertia", num_machines=AXES, num_threads=1) as inside:
         inside.inside.connect_axes(0, AXES)
-        bus = WorldBus(ObservedWorld(inside, lockstep=True))
-        with CanDrives("tgz_d", bus=bus, pace="lockstep", timeout=5.0, safety=Limits(silence=5.0)) as drives:
+        with on_bus(inside, stay=True, timeout=5.0, safety=Limits(silence=5.0)) as drives:
             target = Target(drives, DEVICE, MOTOR, np.full(AXES, 560.0), -WAY, WAY, MOTOR.rated_speed, rated)
             with working_state(target) as working:
                 counts = to_counts(drives, working.current)
                 drives.write(cia402.TARGET_TORQUE, -counts)  # SafetyError if it is beyond the limit
                 assert (counts * ampere_per_count(drives) > 0.998 * rated).all()
-        bus.shutdown()
 
 
 @pytest.mark.slow
@@ -55,8 +53,7 @@ def test_auto_over_a_bus_certifies_both_axes_and_undoes_itself(tmp_path):
     with eds_read_once(), EmulatedDrives("tgz_d", "inertia", num_machines=AXES, num_threads=1) as inside:
         inside.inside.connect_axes(0, AXES)  # as on the node
         before = gains(inside)
-        bus = WorldBus(ObservedWorld(inside, lockstep=True))
-        with CanDrives("tgz_d", bus=bus, pace="lockstep", timeout=5.0, safety=Limits(silence=5.0)) as drives:
+        with on_bus(inside, stay=True, timeout=5.0, safety=Limits(silence=5.0)) as drives:
             volts = np.full(AXES, float(MOTOR.voltage))
             where = {"channel": "here", "nodes": [1]}
             target = Target(drives, DEVICE, MOTOR, volts, -WAY, WAY, MOTOR.rated_speed, MOTOR.rated_current, bus=where)
@@ -72,7 +69,6 @@ def test_auto_over_a_bus_certifies_both_axes_and_undoes_itself(tmp_path):
             restore(drives, load_snapshot(before_file), whole=False)
             np.testing.assert_array_equal(gains(inside), before)
             motion.disable(drives)
-        bus.shutdown()
 
 
 def test_a_sweep_moves_both_axes_of_each_machine_with_a_points_gains():

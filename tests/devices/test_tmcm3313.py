@@ -14,12 +14,11 @@ import pytest
 from rigs import ROOT
 from rigs.canopen_wire import Wire
 from rigs.tables import every_row
-from rigs.world_bus import WorldBus
+from rigs.world_bus import on_bus
 
-from drive_env import CanDrives, EmulatedDrives, motion
-from drive_env.bus.world import World
+from drive_env import EmulatedDrives, motion
 from drive_env.devices import find_device
-from drive_env.dictionary.aborts import READ_ONLY, UNSUPPORTED_ACCESS, VALUE_RANGE, VALUE_TOO_HIGH, VALUE_TOO_LOW
+from drive_env.dictionary.aborts import READ_ONLY, VALUE_RANGE, VALUE_TOO_HIGH, VALUE_TOO_LOW
 from drive_env.dictionary.roles import Role
 from drive_env.emulator.inertia_check import MisfitWarning
 from drive_env.motors import MOTORS
@@ -399,14 +398,6 @@ def test_objects_of_one_value_take_no_other(wire, index):
 
 
 # --- the extension for CAN --------------------------------------------------------------------------------------------
-def test_the_node_has_the_identity_and_none_but_the_axes_of_the_manual(wire):
-    assert [wire.value(0x1018, sub) for sub in range(4)] == [3, 0x286, 3313, 0x00010009]
-    wire.play("""
-        rx 605  40 40 78 00 00 00 00 00   # controlword of a fourth axis
-        tx 585  80 40 78 00 00 00 02 06
-        rx 605  40 10 10 00 00 00 00 00   # it stores nothing
-        tx 585  80 10 10 00 00 00 02 06
-    """)
 
 
 @pytest.mark.parametrize("index", [0x1600, 0x1A00, 0x1C00, 0x1C12, 0x1C13])
@@ -415,31 +406,6 @@ def test_the_image_is_read_over_can_and_not_changed(wire, index):
     for sub in (0, 1):
         assert wire.value(index, sub) == image.dictionary.port(index, sub).read()
     assert wire.download(index, 0, 0, 1) == READ_ONLY
-
-
-def test_pdos_of_axis_0_are_those_of_cia_301_and_the_others_have_no_identifier(wire):
-    wire.start()
-    wire.play("""
-        rx 305  06 00 03                  # RPDO 66: shut down, pv
-        wait 1 ms
-        tx 185  31 02                     # TPDO 65: ready to switch on
-        tx 285  31 02 03                  # TPDO 66
-    """)
-    assert wire.download(0x1481, 1, 0x40000321, 4) == 0
-    wire.play("""
-        rx 321  06 00 08                  # RPDO 130, of axis 1: csp
-        wait 1 ms
-    """)
-    assert [wire.value(index_of(0x6061, axis)) for axis in range(AXES)] == [3, 8, 0]
-
-
-def test_a_pdo_on_can_carries_eight_bytes(wire):
-    assert wire.download(0x1642, 0, 0, 1) == UNSUPPORTED_ACCESS, "in use"
-    assert wire.download(0x1442, 1, 0xC0000405, 4) == wire.download(0x1642, 0, 0, 1) == 0
-    for sub, word in enumerate((0x60400010, 0x607A0020, 0x60FF0020), 1):
-        assert wire.download(0x1642, sub, word, 4) == 0
-    assert wire.download(0x1642, 0, 3, 1) == 0x06040042
-    assert wire.download(0x1642, 0, 2, 1) == 0
 
 
 def cyclic_move(drives):
@@ -454,15 +420,8 @@ def cyclic_move(drives):
 def test_cyclic_targets_over_can_are_what_they_are_in_process():
     with EmulatedDrives("tmcm3313", load="portal", num_threads=1, seed=4) as inside:
         expected = cyclic_move(inside)
-    world = World(lockstep=True)
-    world.add(EmulatedDrives("tmcm3313", load="portal", num_threads=1, seed=4), [1])
-    bus = WorldBus(world)
-    try:
-        with CanDrives("tmcm3313", bus=bus, nodes=(1,), pace="lockstep") as drives:
-            found = cyclic_move(drives)
-    finally:
-        bus.shutdown()
-        world.close()
+    with on_bus(EmulatedDrives("tmcm3313", load="portal", num_threads=1, seed=4)) as drives:
+        found = cyclic_move(drives)
     np.testing.assert_array_equal(found, expected)
     assert np.abs(expected[1, -1]).min() > 3000
 

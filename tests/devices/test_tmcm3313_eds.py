@@ -332,15 +332,6 @@ def test_the_extension_is_what_a_node_on_can_needs(dictionary):
                 assert entry.default == (usual[k] + NODE | 1 << 30 if axis == 0 else 0xC0000000)
 
 
-@pytest.mark.parametrize("base", [0x1600, 0x1A00])
-def test_what_the_factory_maps_can_be_mapped(dictionary, base):
-    for entry in dictionary:
-        if entry.index in range(base, base + 0x200) and entry.sub and entry.default:
-            mapped = dictionary.find((entry.default >> 16, entry.default >> 8 & 0xFF))
-            assert mapped.pdo_mappable and mapped.bits == entry.default & 0xFF
-            assert mapped.access == ("rw" if base == 0x1600 else "ro")
-
-
 def test_names_are_unique_and_tell_the_axis(dictionary):
     names = [entry.name.casefold() for entry in dictionary]
     assert len(names) == len(set(names))

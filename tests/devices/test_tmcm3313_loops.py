@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from rigs.canopen_wire import Wire
 from rigs.closed_loop_rig import MOTOR, NAME, PID_RECIPE, target_of
-from rigs.world_bus import WorldBus
+from rigs.world_bus import on_bus
 
-from drive_env import CanDrives, EmulatedDrives, cia402, motion
-from drive_env.bus.world import World
+from drive_env import EmulatedDrives, cia402, motion
 from drive_env.cia402 import State, state_of
 from drive_env.devices.gain_set import LOAD_ANGLE
 from drive_env.dictionary.roles import Role
@@ -130,16 +129,9 @@ def test_stopped_takes_enabled_axes_to_fault_in_a_loop_or_not():
 
 def over_a_bus(act):
     """Return what acting on a node with its three motors returns, inside the safety envelope, in lockstep."""
-    world = World(lockstep=True)
-    world.add(drives_of(AXES), [1])
-    bus = WorldBus(world)
-    try:
-        with CanDrives("tmcm3313", bus=bus, pace="lockstep") as drives:
-            leave_oscillations_to_trials(drives)
-            return act(drives)
-    finally:
-        bus.shutdown()
-        world.close()
+    with on_bus(drives_of(AXES)) as drives:
+        leave_oscillations_to_trials(drives)
+        return act(drives)
 
 
 @pytest.mark.slow

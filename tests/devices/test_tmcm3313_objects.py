@@ -15,6 +15,8 @@ from rigs.stepper_scenes import (
     ENCODER,
     TURN,
     Scene,
+    check_acts_on_one_axis,
+    check_every_object_is_varied,
     close_loop,
     go,
     label,
@@ -82,17 +84,9 @@ ELSEWHERE = {
 }
 
 
-def keys():
-    return {name if isinstance(name, tuple) else (name, 0) for name in ROWS}
-
-
 def acts_on_one_axis(name, axis):
     scene, one, other = ROWS[name]
-    first, second = vary("tmcm3313", name, scene, one, other, axis, AXES)
-    assert np.isfinite(first).all() and np.isfinite(second).all()
-    differs = [not np.array_equal(first[:, k], second[:, k]) for k in range(AXES)]
-    assert differs[axis], f"{one} and {other} are the same to this drive"
-    assert sum(differs) == 1, f"axis {axis} alone has another value: {differs}"
+    check_acts_on_one_axis(*vary("tmcm3313", name, scene, one, other, axis, AXES), axis)
 
 
 @pytest.mark.slow  # some 90 lives of a module
@@ -108,16 +102,8 @@ def test_so_it_is_on_the_other_axes(name, axis):
 
 
 def test_every_writable_object_of_an_axis_is_varied():
-    """Those of communication (1000h to 1FFFh) have their own tests; nothing of an axis is refused."""
-    writable = {
-        (entry.index, entry.sub)
-        for entry in DEVICE.new_dictionary()
-        if entry.access in ("rw", "rww", "wo")
-        and entry.index >= 0x2000
-        and DEVICE.locate(entry.index)[1] == entry.index
-    }
-    assert writable == keys() | set(ELSEWHERE)
-    assert not keys() & set(ELSEWHERE)
+    """And none of an axis is refused."""
+    check_every_object_is_varied(DEVICE, ROWS, ELSEWHERE)
     assert not {key for key in DEVICE.unsupported if key[0] >= 0x2000}
 
 

@@ -7,9 +7,9 @@ import warnings
 
 import numpy as np
 import pytest
-from rigs.world_bus import WorldBus
+from rigs.world_bus import on_bus
 
-from drive_env import CanDrives, EmulatedDrives, motion
+from drive_env import EmulatedDrives, motion
 from drive_env.bus.world import World
 from drive_env.devices import find_device
 from drive_env.emulator.inertia_check import MisfitWarning
@@ -65,19 +65,15 @@ def test_a_motor_with_too_little_current_is_told_what_torque_that_leaves():
 
 
 # --- axes without a motor ---------------------------------------------------------------------------------------------
-def served(load, num_machines=1, nodes=(1,)):
-    """Return a world with a node, and its bus."""
-    world = World(lockstep=True)
-    world.add(EmulatedDrives("tmcm6212", load, num_machines=num_machines, num_threads=1), nodes)
-    return world, WorldBus(world)
+def machine(load, num_machines=1):
+    return EmulatedDrives("tmcm6212", load, num_machines=num_machines, num_threads=1)
 
 
 @pytest.mark.every(3)
 @pytest.mark.parametrize(("load", "machines", "driven"), [("inertia", 1, 1), ("gantry", 1, 2), ("inertia", 4, 4)])
 def test_axes_that_a_machine_leaves_over_have_no_motor(load, machines, driven):
     """They live, and a phase without current is found once it should have some."""
-    world, bus = served(load, machines)
-    with CanDrives("tmcm6212", bus=bus, pace="lockstep") as drives:
+    with on_bus(machine(load, machines)) as drives:
         has_motor = np.arange(AXES) < driven
         motion.enable(drives, mode="pv")
         assert is_in(drives.read(0x6041), ENABLED).all()
@@ -89,8 +85,6 @@ def test_axes_that_a_machine_leaves_over_have_no_motor(load, machines, driven):
         told = {(one.axis, one.name) for one in drives.emergencies() if one.code == 0x1000}
         assert told == {(axis, "open_load_a") for axis in range(driven, AXES)}
         motion.disable(drives, has_motor)
-    bus.shutdown()
-    world.close()
 
 
 def test_twelve_motors_need_two_nodes_and_seven_leave_five_axes():
@@ -108,8 +102,8 @@ def test_twelve_motors_need_two_nodes_and_seven_leave_five_axes():
 
 def test_the_store_of_a_node_holds_all_of_its_axes():
     """Axis 0 has a motor, axis 5 has none: both are saved, and both come back."""
-    world, _ = served("inertia")
-    node = world.nodes[1]
+    world = World(lockstep=True)
+    (node,) = world.add(machine("inertia"), [1])
     port = lambda index, sub=0: node.dictionary.port(index, sub)  # noqa: E731
     world.power_on()
     for index, raw in ((0x2003, 77), (0x2A03, 99)):
@@ -125,12 +119,10 @@ def test_the_store_of_a_node_holds_all_of_its_axes():
 
 def test_six_axes_that_fault_at_once_are_told_one_by_one():
     """Two messages each: more than the eight of a node with one axis."""
-    world, bus = served("inertia", AXES)
-    with CanDrives("tmcm6212", bus=bus, pace="lockstep") as drives:
+    emulated = machine("inertia", AXES)
+    with on_bus(emulated) as drives:
         motion.enable(drives, mode="pv")
-        world.nodes[1].drives.machine.set_temperatures(25.0, 160.0)
+        emulated.machine.set_temperatures(25.0, 160.0)
         drives.advance(0.01)
         told = [(one.axis, one.name) for one in drives.emergencies()]
     assert sorted(told) == [(k, name) for k in range(AXES) for name in ("overtemperature", "overtemperature_warning")]
-    bus.shutdown()
-    world.close()

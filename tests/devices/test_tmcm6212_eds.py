@@ -385,17 +385,3 @@ def test_the_numbers_of_pdos_are_the_manuals(dictionary):
         assert there == numbers
     mapped = [entry for entry in dictionary if entry.index in range(0x1600, 0x1800) and entry.sub == 0]
     assert {entry.high for entry in mapped} == {3}
-
-
-@pytest.mark.parametrize("base", [0x1600, 0x1A00])
-def test_what_the_factory_maps_can_be_mapped(dictionary, base):
-    for entry in dictionary:
-        if entry.index in range(base, base + 0x200) and entry.sub and entry.default:
-            mapped = dictionary.find((entry.default >> 16, entry.default >> 8 & 0xFF))
-            assert mapped.pdo_mappable and mapped.bits == entry.default & 0xFF
-            assert mapped.access == "ro" or base == 0x1600
-
-
-def test_names_are_unique(dictionary):
-    names = [entry.name.casefold() for entry in dictionary]
-    assert len(names) == len(set(names))

@@ -10,7 +10,19 @@ from typing import Any
 import numpy as np
 import pytest
 from rigs.canopen_wire import Wire
-from rigs.stepper_scenes import BELT, COMMON, TURN, Scene, belt, label, stand, there_and_back, turn, vary
+from rigs.stepper_scenes import (
+    BELT,
+    COMMON,
+    TURN,
+    Scene,
+    belt,
+    check_every_object_is_varied,
+    label,
+    stand,
+    there_and_back,
+    turn,
+    vary,
+)
 
 from drive_env import EmulatedDrives
 from drive_env.devices import find_device
@@ -118,10 +130,6 @@ ELSEWHERE = {
 }
 
 
-def keys():
-    return {name if isinstance(name, tuple) else (name, 0) for name in ROWS}
-
-
 @pytest.mark.slow  # some 50 lives of a drive
 @pytest.mark.parametrize("name", ROWS, ids=label)
 def test_an_object_has_an_effect(name):
@@ -132,17 +140,7 @@ def test_an_object_has_an_effect(name):
 
 
 def test_every_writable_object_of_an_axis_is_varied():
-    """Those of communication (1000h to 1FFFh) have their own tests; axis 0 stands for all."""
-    device = find_device("tmcm6212")
-    writable = {
-        (entry.index, entry.sub)
-        for entry in device.new_dictionary()
-        if entry.access in ("rw", "rww", "wo")
-        and entry.index >= 0x2000
-        and device.locate(entry.index)[1] == entry.index
-    }
-    assert writable == keys() | set(ELSEWHERE)
-    assert not keys() & set(ELSEWHERE)
+    check_every_object_is_varied(find_device("tmcm6212"), ROWS, ELSEWHERE)
 
 
 def test_bit_rate_and_node_id_are_those_that_were_stored_after_a_reset(tmp_path):

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from contextlib import contextmanager
-
 import numpy as np
 import pytest
-from rigs.world_bus import WorldBus, assert_equal
+from rigs.world_bus import assert_equal, on_bus
 
-from drive_env import CanDrives, EmulatedDrives, ObjectAccessError, motion
-from drive_env.bus.world import World
+from drive_env import EmulatedDrives, ObjectAccessError, motion
 
 AXES = 6
 TURN = 51200  # microsteps
@@ -18,21 +15,7 @@ EACH = np.arange(1, AXES + 1)  # axes go different ways
 
 
 def machine(load):
-    return {"load": load, "num_machines": 1 if load == "robot" else AXES, "num_threads": 1}
-
-
-@contextmanager
-def served(load, safety):
-    """Six axes of one node behind a bus."""
-    world = World(lockstep=True)
-    world.add(EmulatedDrives("tmcm6212", **machine(load)), [1])
-    bus = WorldBus(world)
-    try:
-        with CanDrives("tmcm6212", bus=bus, pace="lockstep", safety=safety) as drives:
-            yield drives
-    finally:
-        bus.shutdown()
-        world.close()
+    return EmulatedDrives("tmcm6212", load, num_machines=1 if load == "robot" else AXES, num_threads=1)
 
 
 def watch(drives, seconds, play=None):
@@ -125,19 +108,12 @@ def switch(drives, open_it):
 
 
 def test_the_shutdown_switch_is_told_of_each_axis():
-    with EmulatedDrives("tmcm6212", **machine("inertia")) as drives:
+    with machine("inertia") as drives:
         expected = switch(drives, lambda: setattr(drives.machine, "enable_input", False))
     assert expected == [(axis, 0x5441, (0, 255, 0, 0, 0)) for axis in range(AXES)]
-    world = World(lockstep=True)
-    inside = EmulatedDrives("tmcm6212", **machine("inertia"))
-    world.add(inside, [1])
-    bus = WorldBus(world)
-    try:
-        with CanDrives("tmcm6212", bus=bus, pace="lockstep") as drives:
-            assert switch(drives, lambda: setattr(inside.machine, "enable_input", False)) == expected
-    finally:
-        bus.shutdown()
-        world.close()
+    inside = machine("inertia")
+    with on_bus(inside) as drives:
+        assert switch(drives, lambda: setattr(inside.machine, "enable_input", False)) == expected
 
 
 LOADS = {pp: "robot", six_point: "inertia", pv: "robot", csp: "robot", csv: "robot", homing: "belt", fault: "inertia"}
@@ -155,9 +131,9 @@ SCRIPTS = {script.__name__: script for script in LOADS}
 )
 def test_the_same_script_gives_the_same_integers(name, safety):
     script = SCRIPTS[name]
-    with EmulatedDrives("tmcm6212", **machine(LOADS[script])) as drives:
+    with machine(LOADS[script]) as drives:
         expected = list(script(drives))
-    with served(LOADS[script], safety) as drives:
+    with on_bus(machine(LOADS[script]), safety=safety) as drives:
         found = list(script(drives))
     messages = [isinstance(part, list) for part in expected]
     for told, part, other in zip(messages, expected, found, strict=True):
@@ -190,8 +166,8 @@ def test_the_same_script_gives_the_same_integers(name, safety):
     ],
 )
 def test_what_is_refused_is_refused_with_the_same_code(name, value):
-    with EmulatedDrives("tmcm6212", **machine("inertia")) as drives, pytest.raises(ObjectAccessError) as expected:
+    with machine("inertia") as drives, pytest.raises(ObjectAccessError) as expected:
         drives.write(name, value)
-    with served("inertia", True) as drives, pytest.raises(ObjectAccessError) as found:
+    with on_bus(machine("inertia")) as drives, pytest.raises(ObjectAccessError) as found:
         drives.write(name, value)
     assert found.value.abort_code == expected.value.abort_code

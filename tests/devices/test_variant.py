@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from contextlib import contextmanager
 from dataclasses import replace
 
 import canopen
@@ -12,7 +11,7 @@ import numpy as np
 import pytest
 from rigs.canopen_wire import Wire
 from rigs.tables import every_row
-from rigs.world_bus import WorldBus
+from rigs.world_bus import WorldBus, on_bus
 from typer.testing import CliRunner
 
 from drive_env import CanDrives, EmulatedDrives, motion
@@ -414,19 +413,6 @@ def test_a_node_takes_both_ends_of_the_range_and_nothing_beyond(drives, key):
                 assert wire.value(*key) == raw
 
 
-@contextmanager
-def on_a_bus(device, **options):
-    world = World(lockstep=True)
-    world.add(drives_of(device), [1])
-    bus = WorldBus(world)
-    try:
-        with CanDrives(device, bus=bus, nodes=[1], pace="lockstep", **options) as drives:
-            yield drives
-    finally:
-        bus.shutdown()
-        world.close()
-
-
 def programme(drives):
     objects = [0x6041, 0x6062, 0x6064, 0x606C, 0x6077]
     unmapped = [0x606B, 0x6074, (0x1018, 4), 0x67FF, (0x270C, 5), (0x2042, 5), 0x6072]
@@ -449,7 +435,7 @@ def programme(drives):
 
 @pytest.mark.parametrize("safety", [True, False])
 def test_on_a_bus_it_is_the_same_to_the_integer(safety):
-    with on_a_bus(NAME, safety=safety) as far, drives_of() as near:
+    with on_bus(drives_of(NAME), safety=safety) as far, drives_of() as near:
         assert far.device.name == NAME
         for told, known in zip(programme(far), programme(near), strict=True):
             np.testing.assert_array_equal(told, known)
@@ -458,7 +444,7 @@ def test_on_a_bus_it_is_the_same_to_the_integer(safety):
 @pytest.mark.every(2)
 @pytest.mark.parametrize("device", [BASE.name, NAME])
 def test_the_envelope_holds_speeds_and_ramps_in_whatever_they_count(device):
-    with on_a_bus(device) as drives:
+    with on_bus(drives_of(device)) as drives:
         for refused, taken in (("6001 rpm", "5999 rpm"), ("-6001 rpm", "-5999 rpm")):
             drives.write("Target velocity", taken)
             with pytest.raises(SafetyError, match=r"60FFh:00 Target velocity = .* is beyond the limit (6000|6553600);"):
@@ -484,7 +470,7 @@ def test_the_envelope_holds_speeds_and_ramps_in_whatever_they_count(device):
 @pytest.mark.parametrize("device", [BASE.name, NAME])
 def test_the_envelope_stops_an_axis_that_is_faster_than_its_limit(device):
     turn = {BASE.name: TURN / 60.0, NAME: 1.0}[device]
-    with on_a_bus(device, safety=Limits(velocity=400 * turn)) as drives:
+    with on_bus(drives_of(device), safety=Limits(velocity=400 * turn)) as drives:
         motion.enable(drives, mode="cst")
         with pytest.raises(SafetyError, match="606Ch:00 Velocity actual value"):
             drives.record([0x606C], 0.5, {0x6071: np.full(500, 800)})

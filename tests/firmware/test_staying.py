@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 from rigs.ethercat_segment import EmulatedSegment
-from rigs.world_bus import WorldBus
+from rigs.world_bus import bus_of
 
 from drive_env import CanDrives, EmulatedDrives, cia402, motion
-from drive_env.bus.world import World
 from drive_env.devices import find_device
 from drive_env.dictionary.roles import Role
 from drive_env.master.ethercat_drives import EtherCatDrives
@@ -66,10 +65,8 @@ def test_another_mode_turns_no_enabled_motor(device, mode):
 
 @pytest.mark.parametrize("mode", ["pv", "csv", "cst", "csp"])
 def test_nor_over_a_bus(mode):
-    world = World(lockstep=True)
-    with EmulatedDrives("tmcm1636", "inertia", num_threads=1) as inside:
-        world.add(inside, (1,))
-        bus = WorldBus(world)
+    inside = EmulatedDrives("tmcm1636", "inertia", num_threads=1)
+    with bus_of(inside, [1]) as bus:
         with CanDrives(bus=bus, pace="lockstep", safety=False) as dead:
             leave(dead, "tmcm1636")
         with CanDrives(bus=bus, pace="lockstep") as drives:

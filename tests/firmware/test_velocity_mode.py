@@ -6,6 +6,7 @@ Ramps are closed forms: a speed of 6048h:01 is gained in 6048h:02, and so on. Al
 from __future__ import annotations
 
 import json
+from contextlib import ExitStack
 
 import numpy as np
 import pytest
@@ -14,11 +15,10 @@ from rigs.makers import files
 from rigs.pump import NODE
 from rigs.served_drives import node
 from rigs.small_eds import FOLDER, put
-from rigs.world_bus import WorldBus
+from rigs.world_bus import bus_of, on_bus
 from typer.testing import CliRunner
 
 from drive_env import CanDrives, EmulatedDrives, Limits, cia402, motion
-from drive_env.bus.world import World
 from drive_env.commands.cli import app
 from drive_env.devices import find_device
 from drive_env.devices.new_device import new_device
@@ -362,10 +362,7 @@ def test_6047h_limits_each_direction_within_6046h(timed, target, turns, limited)
 
 def test_our_master_reads_the_ramp_of_a_quick_stop_from_604eh_and_6051h(of_times, timed):
     """250 ms for 1,000 rpm allow 4,000 rpm, a second; 2,000 ms allow 500."""
-    world = World(lockstep=True)
-    world.add(timed, [NODE])
-    bus = WorldBus(world)
-    with CanDrives(eds=of_times[0], bus=bus, nodes=(NODE,), pace="lockstep") as drives:
+    with on_bus(timed, (NODE,), eds=of_times[0]) as drives:
         set_times(timed)  # a drive that is found anew has its stored ones
         motion.enable(drives, mode="vl")
         motion.turn(drives, 600)
@@ -379,29 +376,22 @@ def test_our_master_reads_the_ramp_of_a_quick_stop_from_604eh_and_6051h(of_times
         drives.write(0x6051, 2000)
         with pytest.raises(SafetyError, match=r"is beyond the limit 500.* it \(in vl 604Eh\) stops"):
             motion.turn(drives, 600)
-    bus.shutdown()
-    world.close()
 
 
 # --- over a bus, by our master, with its limits -----------------------------------------------------------------------
 @pytest.fixture
 def on_a_bus(folders):
     """Return a function that gives a drive, and our master of it, which knows the vendor's EDS alone."""
-    opened = []
+    with ExitStack() as opened:
 
-    def connect(name, values=None, **options):
-        drive, world = emulated(folders[name]), World(lockstep=True)
-        world.add(drive, [NODE])
-        bus = WorldBus(world)
-        opened.append((bus, world))
-        for object_, value in (values or {}).items():
-            drive.write(object_, value)
-        return drive, CanDrives(eds=EDS[name], bus=bus, nodes=(NODE,), pace="lockstep", **options)
+        def connect(name, values=None, **options):
+            drive = emulated(folders[name])
+            bus = opened.enter_context(bus_of(drive, (NODE,)))
+            for object_, value in (values or {}).items():
+                drive.write(object_, value)
+            return drive, CanDrives(eds=EDS[name], bus=bus, nodes=(NODE,), pace="lockstep", **options)
 
-    yield connect
-    for bus, world in opened:
-        bus.shutdown()
-        world.close()
+        yield connect
 
 
 def rpm(drive):

@@ -1,4 +1,4 @@
-"""docs/messages.md names every message that a user may meet, and none that the code has no more."""
+"""docs/messages.md has a row for each message that leaves a question, and none that the code has no more."""
 
 from __future__ import annotations
 
@@ -88,14 +88,20 @@ def raised():
 
 @cache
 def told():
-    """Return every text by which a command ends, and every warning and error of a log."""
+    """Return every text by which a command ends, as USER_ERROR with exit code 2, and warnings and errors of a log."""
     return [
-        Message(f"{place}:{node.lineno}", "", text)
+        Message(f"{place}:{node.lineno}", is_mistake(node) * "USER_ERROR", text)
         for place, nodes in modules().items()
         for node in nodes
         if isinstance(node, ast.Call) and node.args and re.search(TELLING, ast.unparse(node.func))
         if re.search(r"[a-z]{3}", text := text_of(node.args[0]))
     ]
+
+
+def is_mistake(call):
+    """Return whether a call ends a command for a mistake of its user."""
+    name = ast.unparse(call.func)
+    return name.endswith("fail") and (len(call.args) == 1 or ast.unparse(call.args[1]) == "USER_ERROR")
 
 
 def literals(nodes):
@@ -148,10 +154,22 @@ def has_a_row(text):
     return any(fits(pattern, text) for pattern in PATTERNS)
 
 
+@cache
+def classes_of(error):
+    """Return the name of an error and of all classes that it derives from, as far as they are ours."""
+    bases = {
+        ast.unparse(base)
+        for nodes in modules().values()
+        for node in nodes
+        if isinstance(node, ast.ClassDef) and node.name == error
+        for base in node.bases
+    }
+    return {error}.union(*map(classes_of, bases))
+
+
 def family_of(message):
     for family in DATA["family"]:
-        place = message.place.rsplit(":", 1)[0]
-        if message.error in family.get("errors", ()) and any(fnmatch.fnmatch(place, one) for one in family["where"]):
+        if classes_of(message.error) & set(family.get("errors", ())):
             return family["title"]
         if any(fits(text, message.text) for text in family.get("texts", ())):
             return family["title"]
@@ -243,6 +261,6 @@ def test_the_page_is_current():
 
 # --- the test itself --------------------------------------------------------------------------------------------------
 def test_a_message_that_is_new_is_found():
-    new = Message("drive_env/commands/new.py:1", "ValueError", "the frobnicator … has no grommet")
+    new = Message("drive_env/commands/new.py:1", "BusError", "the frobnicator … has no grommet")
     assert without_a_row([new]) != []
     assert not expression("cannot open interface …").search("cannot close the interface x")

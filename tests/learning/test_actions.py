@@ -4,7 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 from rigs.tables import every_row
-from rigs.world_bus import on_a_bus
+from rigs.world_bus import on_bus
 
 from drive_env import EmulatedDrives, ObjectAccessError
 from drive_env.envs.gain_scheduling import GainScheduling
@@ -42,7 +42,7 @@ class Watched:
 @pytest.mark.parametrize("value", NO_NUMBERS)
 @pytest.mark.parametrize("name", ENVIRONMENTS)
 def test_drives_of_a_bus_are_told_nothing(name, value):
-    with EmulatedDrives(load="inertia", num_threads=1) as emulated, on_a_bus(emulated) as drives:
+    with EmulatedDrives(load="inertia", num_threads=1) as emulated, on_bus(emulated, safety=False) as drives:
         watched = Watched(drives)
         env = gymnasium.make(name, load="inertia", distributions=None, drives=watched).unwrapped
         env.reset(seed=0)
@@ -104,7 +104,7 @@ def drives(request):
         if request.param == "emulator":
             yield emulated
             return
-        with on_a_bus(emulated) as found:
+        with on_bus(emulated, safety=False) as found:
             yield found
 
 

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from rigs.agent_files import ENTRIES, bundle, observations
-from rigs.world_bus import WorldBus
+from rigs.world_bus import on_bus
 from typer.testing import CliRunner
 
 from agents.commands.cli import app
@@ -28,7 +28,7 @@ from agents.policies.guard import GuardLimits
 from agents.policies.policy import PolicyError, policy_of
 from agents.seeds import EVALUATION
 from agents.tasks import make_environments
-from drive_env import CanDrives, EmulatedDrives, Limits, motion
+from drive_env import EmulatedDrives, Limits, motion
 from drive_env.bus.hub import Hub
 from drive_env.bus.server import Server
 from drive_env.bus.world import World
@@ -245,13 +245,8 @@ def test_over_can_in_lockstep_actions_and_figures_are_the_same():
         found["emulator"] = evaluate(
             Gentle(), "tracking", SHORT, on=GivenDrives(as_on_a_bus(emulated), guard=PATIENT, side="one"), episodes=2
         )
-    world = World(lockstep=True)
-    world.add(EmulatedDrives(load="two_mass", num_threads=1), [1])
-    bus = WorldBus(world)
-    with CanDrives(bus=bus, pace="lockstep", safety=Limits(velocity=100 * TURN)) as drives:
+    with on_bus(EmulatedDrives(load="two_mass", num_threads=1), safety=Limits(velocity=100 * TURN)) as drives:
         found["bus"] = evaluate(Gentle(), "tracking", SHORT, on=GivenDrives(drives, guard=PATIENT), episodes=2)
-    bus.shutdown()
-    world.close()
     for one, two in zip(found["emulator"].episodes, found["bus"].episodes, strict=True):
         assert np.array_equal(one.actions, two.actions) and np.array_equal(one.observations, two.observations)
     for row in gap.compare(found["emulator"], found["bus"]):

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rigs.world_bus import WorldBus
+from rigs.world_bus import bus_of
 
 from drive_env import CanDrives, EmulatedDrives, ObjectAccessError
 from drive_env.bus.bits import frame_bits
-from drive_env.bus.world import World
 from drive_env.canopen.frames import Frame
 from drive_env.fieldbus.description import describe
 from drive_env.master.can import bus_time
@@ -55,12 +54,8 @@ def test_six_axes_in_a_millisecond():
 @pytest.fixture
 def link():
     """Six axes behind a link of 1 Mbit/s, and what it sends; a function takes the cycle."""
-    world = World(lockstep=True)
-    world.add(EmulatedDrives("tmcm6212", "robot", num_threads=1), [1])
-    bus = WorldBus(world)
-    yield lambda cycle: CanLink(Port(bus, owned=False), (1,), SIX, BusTime(1e6, cycle))
-    bus.shutdown()
-    world.close()
+    with bus_of(EmulatedDrives("tmcm6212", "robot", num_threads=1), [1]) as bus:
+        yield lambda cycle: CanLink(Port(bus, owned=False), (1,), SIX, BusTime(1e6, cycle))
 
 
 def test_what_is_welcome_is_left_out_where_a_cycle_has_no_room_for_it(link):

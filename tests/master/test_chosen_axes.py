@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from rigs.commands import drive_tune
 from rigs.six_axes import AXES, WIRED, partly_wired
-from rigs.world_bus import WorldBus
+from rigs.world_bus import WorldBus, on_bus
 
 from drive_env import CanDrives, Limits, cia402, motion
 from drive_env.bus.hub import Hub
@@ -178,16 +178,11 @@ def test_errors_call_an_axis_by_its_own_number():
 def test_export_of_one_axis_has_its_values_and_the_nodes_in_process_and_on_a_bus():
     from drive_env.master.commissioned_eds import commissioned_values
 
-    with partly_wired() as whole:
-        world = World(lockstep=True)
-        world.add(whole, [1])
-        bus = WorldBus(world)
+    whole = partly_wired()
+    with on_bus(whole, safety=False) as drives:
         whole.write(0x2003, np.arange(100, 100 + AXES))
         every, one = commissioned_values(whole), commissioned_values(whole, axis=3)
-        with CanDrives("tmcm6212", bus=bus, pace="lockstep", safety=False) as drives:
-            read = commissioned_values(drives, axis=3)
-        bus.shutdown()
-        world.close()
+        read = commissioned_values(drives, axis=3)
     assert (one[0x2603, 0], (0x2003, 0) in one, (0x2203, 0) in one) == (103, False, False)
     of_node = {key: value for key, value in every.items() if key[0] >= 0x2000 and whole.device.is_shared(key[0])}
     of_axis = {key: value for key, value in every.items() if whole.device.locate(key[0])[0] == 3}

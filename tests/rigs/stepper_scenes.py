@@ -341,3 +341,30 @@ COMMON: dict[Any, tuple[Scene, int, int]] = {
     0x60F2: (Scene(interrupted), 0, 2),
     0x60FF: (Scene(turn), TURN, 2 * TURN),
 }  # fmt: skip
+
+
+# --- of the tests that vary every writable object of a device ---------------------------------------------------------
+def check_acts_on_one_axis(first, second, axis):
+    """Hold that what is seen with two values of an object of one axis differs on that axis, and on no other."""
+    assert np.isfinite(first).all() and np.isfinite(second).all()
+    differs = [not np.array_equal(one, other) for one, other in zip(first.T, second.T, strict=True)]
+    assert differs[axis], "both values are the same to this drive"
+    assert sum(differs) == 1, f"axis {axis} alone has another value: {differs}"
+
+
+def check_every_object_is_varied(device, rows, elsewhere, idle=frozenset()):
+    """Hold that each writable object of axis 0 is in the rows, in another test, or without effect, and in one alone.
+
+    Those of communication (1000h to 1FFFh) have their own tests.
+    """
+    varied = {name if isinstance(name, tuple) else (name, 0) for name in rows}
+    writable = {
+        (entry.index, entry.sub)
+        for entry in device.new_dictionary()
+        if entry.access in ("rw", "rww", "wo")
+        and entry.index >= 0x2000
+        and device.locate(entry.index)[1] == entry.index
+    }
+    idle = writable & set(idle)
+    assert writable == varied | set(elsewhere) | idle
+    assert not varied & set(elsewhere) and not idle & (varied | set(elsewhere))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import uuid
 from collections import deque
 from contextlib import contextmanager
@@ -44,18 +45,46 @@ class WorldBus(can.BusABC):
 
 
 @contextmanager
+def bus_of(emulated, nodes, *, stay=False):
+    """A bus in lockstep with nodes of emulated drives, which end with it unless they `stay`."""
+    world = World(lockstep=True)
+    world.add(emulated, list(nodes))
+    bus = WorldBus(world)
+    try:
+        yield bus
+    finally:
+        bus.shutdown()
+        if not stay:
+            world.close()
+
+
+@contextmanager
+def on_bus(emulated, nodes=None, *, stay=False, **options):
+    """Emulated drives on a bus in lockstep, by our master: by default as nodes 1 and so on, of a device that it knows.
+
+    Args:
+        emulated: The drives, which end with the bus unless they `stay`.
+        nodes: The numbers of their nodes.
+        options: The master's.
+    """
+    nodes = nodes or range(1, 1 + math.ceil(emulated.num_axes / emulated.device.num_axes))
+    known = {"device": emulated.device.name} | options
+    with bus_of(emulated, nodes, stay=stay) as bus, CanDrives(bus=bus, nodes=nodes, pace="lockstep", **known) as drives:
+        yield drives
+
+
+@contextmanager
 def served(how, nodes=(1,), safety=True, **machine):
     """Emulated drives behind a bus, as CanDrives."""
+    emulated = EmulatedDrives(num_threads=1, **machine)
+    if how == "calls":
+        with on_bus(emulated, nodes, safety=safety) as drives:
+            yield drives
+        return
     world = World(lockstep=True)
-    world.add(EmulatedDrives(num_threads=1, **machine), list(nodes))
+    world.add(emulated, list(nodes))
     options = {"nodes": nodes, "pace": "lockstep", "safety": safety}
     try:
-        if how == "calls":
-            bus = WorldBus(world)
-            with CanDrives(bus=bus, **options) as drives:
-                yield drives
-            bus.shutdown()
-            return
         if how == "hub":
             port = Hub()
             where = {"channel": port.channel}
@@ -75,18 +104,3 @@ def assert_equal(expected, found):
         wrong = np.argwhere(a != b)
         assert not wrong.size, f"part {k}: first difference at object, cycle, axis {wrong[0]}: {a[tuple(wrong[0])]}, " \
             f"on the bus {b[tuple(wrong[0])]}"  # fmt: skip
-
-
-@contextmanager
-def on_a_bus(emulated):
-    """Emulated drives as CanDrives, one node per axis."""
-    world = World(lockstep=True)
-    nodes = list(range(1, emulated.num_axes + 1))
-    world.add(emulated, nodes)
-    bus = WorldBus(world)
-    try:
-        with CanDrives(bus=bus, nodes=nodes, pace="lockstep", safety=False) as drives:
-            yield drives
-    finally:
-        bus.shutdown()
-        world.close()

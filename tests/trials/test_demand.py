@@ -7,8 +7,9 @@ import pytest
 
 from drive_env import EmulatedDrives, cia402
 from drive_env.dictionary.roles import Role
+from drive_env.drives.interface import CYCLE
 from drive_env.trials.demand import computed, is_recorded
-from drive_env.trials.positioning import CYCLE, TRIAL, plan_move, power_up, start, write_profile
+from drive_env.trials.positioning import TRIAL, plan_move, power_up, start, write_profile
 
 
 @pytest.mark.parametrize("device", ["tmcm1636", "tgz_d"])

@@ -9,6 +9,7 @@ import pytest
 
 from drive_env import cia402
 from drive_env.devices import find_device
+from drive_env.drives.interface import CYCLE
 from drive_env.motors import MOTORS, find_motor
 from drive_env.trials import gain_trial
 from drive_env.trials.gain_trial import (
@@ -24,7 +25,6 @@ from drive_env.trials.gain_trial import (
 )
 from drive_env.trials.oscillation import shakes
 from drive_env.trials.positioning import (
-    CYCLE,
     PROFILE,
     QUIET,
     SETTLED,

@@ -13,12 +13,12 @@ from drive_env import cia402
 from drive_env.devices import find_device
 from drive_env.devices.gains import gains_in_si
 from drive_env.dictionary.roles import Role
+from drive_env.drives.interface import CYCLE
 from drive_env.drives.raw_gains import write_gains
 from drive_env.emulator.inertia_check import MisfitWarning
 from drive_env.loops.linear_model import Plant
 from drive_env.loops.margins import margins
 from drive_env.motors import find_motor
-from drive_env.trials.positioning import CYCLE
 from tuning.rules import relay as module
 from tuning.rules.lags import velocity_lag
 from tuning.rules.optima import take_current

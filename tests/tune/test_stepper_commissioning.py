@@ -9,11 +9,10 @@ import shutil
 import numpy as np
 import pytest
 from rigs.stepper_rig import BARE, lane
-from rigs.world_bus import WorldBus
+from rigs.world_bus import on_bus
 from typer.testing import CliRunner
 
-from drive_env import CanDrives, EmulatedDrives, cia402
-from drive_env.bus.world import World
+from drive_env import EmulatedDrives, cia402
 from drive_env.devices import find_device
 from drive_env.dictionary.roles import Role
 from drive_env.drives.raw_gains import write_gains
@@ -236,18 +235,11 @@ def test_a_motor_that_is_too_weak_for_its_load_is_rejected_with_the_reason(stepp
 MACHINES = {"load": "inertia", "motor": NAME, "num_machines": 6, "num_threads": 1}
 
 
-def on_bus(device, act):
+def over_a_bus(device, act):
     """Return what acting on a node with its six motors returns, inside the safety envelope, in lockstep."""
-    world = World(lockstep=True)
-    world.add(EmulatedDrives(device, **MACHINES), [1])
-    bus = WorldBus(world)
-    try:
-        with CanDrives(device, bus=bus, pace="lockstep") as drives:
-            leave_oscillations_to_trials(drives)
-            return act(drives)
-    finally:
-        bus.shutdown()
-        world.close()
+    with on_bus(EmulatedDrives(device, **MACHINES)) as drives:
+        leave_oscillations_to_trials(drives)
+        return act(drives)
 
 
 def six_axes(drives):
@@ -268,7 +260,7 @@ def test_a_search_of_currents_finds_the_same_in_process_and_over_the_bus():
 
     with EmulatedDrives("tmcm6212", **MACHINES) as drives:
         inside = act(drives)
-    assert on_bus("tmcm6212", act) == inside and len(inside) == 12
+    assert over_a_bus("tmcm6212", act) == inside and len(inside) == 12
 
 
 @pytest.mark.slow
@@ -284,7 +276,7 @@ def test_commissioning_finds_the_same_in_process_and_over_the_bus(tmp_path):
 
     with EmulatedDrives("tmcm6212", **MACHINES) as drives:
         inside = act(drives)
-    outside = on_bus("tmcm6212", act)
+    outside = over_a_bus("tmcm6212", act)
     loaded = ("teeth lost at an obstacle", "load of 30 % that does not stop it came within [s]",
               "obstacle that stops it came within [s]")  # fmt: skip
     for (after, figures, verdict, own), (far, seen, told, reservations) in zip(inside, outside, strict=True):

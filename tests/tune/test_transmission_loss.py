@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from drive_env.drives.interface import CYCLE
 from drive_env.motors import find_motor
-from drive_env.trials.positioning import CYCLE
 from tuning.identify.momentum_balance import balance_rows, motion, solve
 from tuning.identify.transmission_loss import Loss, find_losses, friction_of_whole_ways
 

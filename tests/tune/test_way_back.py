@@ -259,18 +259,13 @@ def test_an_image_that_a_killed_run_left_on_ethercat_is_undone():
 def test_what_is_borrowed_of_axes_left_out_is_in_the_file_and_comes_back(tmp_path):
     """PDOs are mapped for a whole TMCM-6212: 50 objects of axes 1 to 5 stayed changed after `--axis 0` was killed."""
     from rigs.six_axes import partly_wired
-    from rigs.world_bus import WorldBus
+    from rigs.world_bus import on_bus
 
-    from drive_env import CanDrives
-    from drive_env.bus.world import World
     from drive_env.drives.chosen_axes import ChosenAxes
     from drive_env.master.parameters import read_parameters
     from tuning.snapshot import load_snapshot, restore, take_of
 
-    world = World(lockstep=True)
-    world.add(partly_wired(), [1])
-    bus = WorldBus(world)
-    with CanDrives("tmcm6212", bus=bus, pace="lockstep", safety=False) as drives:
+    with on_bus(partly_wired(), safety=False) as drives:
         before = [read_parameters(drives, axis) for axis in range(6)]
         taken = take_of(ChosenAxes(drives, (3,)), {"axes": [3], "nodes": [1], "channel": "here"})
         assert list(taken.left_out) == [0, 1, 2, 4, 5]
@@ -287,5 +282,3 @@ def test_what_is_borrowed_of_axes_left_out_is_in_the_file_and_comes_back(tmp_pat
         drives.write(0x2003, 77, where=np.arange(6) == 1)  # another program's, of an axis that was not chosen
         motion.select_mode(drives, "pv")
         assert differences(drives, taken) == []
-    bus.shutdown()
-    world.close()

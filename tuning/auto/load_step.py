@@ -14,9 +14,9 @@ from scipy.signal import detrend
 
 from drive_env import cia402, motion
 from drive_env.drives.currents import ampere_per_count
-from drive_env.drives.interface import machine_of
+from drive_env.drives.interface import CYCLE, machine_of
 from drive_env.trials import response
-from drive_env.trials.positioning import CYCLE, wrapped
+from drive_env.trials.positioning import wrapped
 from mechanics.arrays import Mask
 from tuning.certificate.certificate import StepResponse
 

@@ -18,6 +18,7 @@ from drive_env import cia402, motion
 from drive_env.devices.gains import small_time_constants
 from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count
+from drive_env.drives.interface import CYCLE
 from drive_env.drives.observed import ObservedDrives
 from drive_env.drives.raw_gains import write_gains
 from drive_env.drives.trace import Trace
@@ -26,7 +27,6 @@ from drive_env.trials.demand import computed, is_recorded
 from drive_env.trials.gain_trial import PHASE_TITLES, PHASES, Trials, measured_cost, softness
 from drive_env.trials.oscillation import OSCILLATION, shakes
 from drive_env.trials.positioning import (
-    CYCLE,
     TRIAL,
     WATCH,
     Move,

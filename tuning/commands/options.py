@@ -29,6 +29,7 @@ from drive_env.commands.options import ask as ask
 from drive_env.commands.options import ending_by, file_names_a_bus, grouped, names_a_bus, options_of, with_options
 from drive_env.commands.options import look_first as look_first
 from drive_env.commands.options import print_json as print_json
+from drive_env.commands.options import print_result as print_result
 from drive_env.commands.progress import progress_on
 from drive_env.default_device import DEFAULT_DEVICE
 

@@ -20,7 +20,7 @@ from tuning.commands.options import (
     errors_as_exit_codes,
     fail,
     look_first,
-    print_json,
+    print_result,
 )
 
 if TYPE_CHECKING:
@@ -74,15 +74,15 @@ def undo(
             if address == snapshot.bus:
                 print(f"drive-tune: {what_is_changed(file)}", file=sys.stderr)
             raise
-    if json:
-        rows = [{"axis": k, "object": c.entry.label, "found": c.found, "restored": c.wanted} for k, c in changed]
-        print_json({"changed": rows, "verified": verified, "stored": keep})
-        return
-    for axis, change in changed:
-        print(f"axis {axis}: {change.entry.label}: {change.found} -> {change.wanted}")
+    rows = [{"axis": k, "object": c.entry.label, "found": c.found, "restored": c.wanted} for k, c in changed]
+    lines = [f"axis {axis}: {change.entry.label}: {change.found} -> {change.wanted}" for axis, change in changed]
     kept = "; stored in the drives" if keep else ""
-    count = f"{len(changed)} parameter{'s' * (len(changed) != 1)}"
-    print(f"{count} restored, {verified} verified by a second reading{kept}")
+    lines.append(f"{_counted(changed)} restored, {verified} verified by a second reading{kept}")
+    print_result({"changed": rows, "verified": verified, "stored": keep}, lines, json)
+
+
+def _counted(changes: list[tuple[int, Any]]) -> str:
+    return f"{len(changes)} parameter{'s' * (len(changes) != 1)}"
 
 
 def _planned(
@@ -106,15 +106,11 @@ def _planned(
 
 def _print_plan(planned: list[tuple[int, Difference]], *, store: bool, json: bool) -> None:
     """Print the changes that a restoration would make."""
-    if json:
-        rows = [{"axis": k, "object": c.entry.label, "found": c.found, "wanted": c.wanted} for k, c in planned]
-        print_json({"would change": rows, "would store": store, "written": 0})
-        return
-    for axis, change in planned:
-        print(f"axis {axis}: {change.entry.label}: {change.found}, would be {change.wanted}")
+    rows = [{"axis": k, "object": c.entry.label, "found": c.found, "wanted": c.wanted} for k, c in planned]
+    lines = [f"axis {axis}: {change.entry.label}: {change.found}, would be {change.wanted}" for axis, change in planned]
     kept = ", and stored" if store else ""
-    count = f"{len(planned)} parameter{'s' * (len(planned) != 1)}"
-    print(f"{count} would be restored{kept} (dry run: nothing was written)")
+    lines.append(f"{_counted(planned)} would be restored{kept} (dry run: nothing was written)")
+    print_result({"would change": rows, "would store": store, "written": 0}, lines, json)
 
 
 def _restore(

@@ -19,8 +19,8 @@ import numpy as np
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import to_counts
+from drive_env.drives.interface import CYCLE
 from drive_env.safety.envelope import swinging_allowed
-from drive_env.trials.positioning import CYCLE
 from mechanics.arrays import Floats, Mask
 from tuning.estimate import Estimate, refused
 from tuning.identify.wiring import Halls, judge_halls

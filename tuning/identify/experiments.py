@@ -12,10 +12,10 @@ from drive_env import cia402
 from drive_env.devices.gains import bandwidth_gains, check_linear_model
 from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count
+from drive_env.drives.interface import CYCLE
 from drive_env.drives.observed import ObservedDrives
 from drive_env.drives.raw_gains import write_gains
 from drive_env.safety.envelope import swinging_allowed
-from drive_env.trials.positioning import CYCLE
 from mechanics.arrays import Floats, Integers, Mask
 from tuning.estimate import Estimate, refused
 from tuning.identify.encoder_check import PULSED, EncoderCheck, check_encoders

@@ -23,10 +23,10 @@ from drive_env import cia402
 from drive_env.devices.gains import as_chip
 from drive_env.dictionary.units import RPM
 from drive_env.drives.currents import ampere_per_count
+from drive_env.drives.interface import CYCLE
 from drive_env.drives.raw_gains import write_gains
 from drive_env.emulator.parameters import velocity_filter
 from drive_env.motors import Motor
-from drive_env.trials.positioning import CYCLE
 from mechanics.arrays import Floats, Integers, Mask
 from tuning.estimate import Estimate, refused
 from tuning.identify.confidence import gain_error, interval, t_quantile

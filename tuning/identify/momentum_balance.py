@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drive_env.trials.positioning import CYCLE
+from drive_env.drives.interface import CYCLE
 from mechanics.arrays import Floats, Integers
 
 SMOOTHED = 9  # samples over which a signal is averaged

@@ -15,7 +15,7 @@ import numpy as np
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count, to_counts
-from drive_env.trials.positioning import CYCLE
+from drive_env.drives.interface import CYCLE
 from mechanics.arrays import Floats
 from tuning.estimate import Estimate, refused
 from tuning.identify.confidence import gain_error, interval, t_quantile

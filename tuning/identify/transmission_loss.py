@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from drive_env.trials.positioning import CYCLE
+from drive_env.drives.interface import CYCLE
 from mechanics.arrays import Floats
 from tuning.identify.confidence import t_quantile
 from tuning.identify.momentum_balance import Motion, Solved, balance_rows, smoothed, solve, step

@@ -20,11 +20,10 @@ from drive_env.devices.gains import bandwidth_gains
 from drive_env.dictionary.entries import ObjectName
 from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count, read_current_limit, to_counts, write_current_limit
-from drive_env.drives.interface import Drives, axis_number
+from drive_env.drives.interface import CYCLE, Drives, axis_number
 from drive_env.drives.raw_gains import write_gains
 from drive_env.drives.speeds import per_increment
 from drive_env.motors import Motor
-from drive_env.trials.positioning import CYCLE
 from mechanics.arrays import Floats, Integers, Mask
 from tuning.identify.wiring import FINDINGS
 from tuning.stop_causes import told_causes

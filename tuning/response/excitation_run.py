@@ -19,9 +19,9 @@ from drive_env import cia402, motion
 from drive_env.dictionary.entries import ObjectName
 from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count, to_counts
-from drive_env.drives.interface import Drives
+from drive_env.drives.interface import CYCLE, Drives
 from drive_env.drives.speeds import per_increment
-from drive_env.trials.positioning import CYCLE, wrapped
+from drive_env.trials.positioning import wrapped
 from mechanics.arrays import Floats, Integers, Mask
 from tuning.response.excitation import Lines, periodic
 from tuning.target import Target

@@ -17,11 +17,11 @@ import numpy as np
 from drive_env import cia402
 from drive_env.devices.gains import check_linear_model
 from drive_env.drives.currents import ampere_per_count, read_current_limit
+from drive_env.drives.interface import CYCLE
 from drive_env.drives.raw_gains import read_gains
 from drive_env.loops.linear_model import Plant, controllers
 from drive_env.safety.envelope import swinging_allowed
 from drive_env.trials.oscillation import shakes, strongest_frequency
-from drive_env.trials.positioning import CYCLE
 from mechanics.arrays import Complex, Floats, Integers, Mask
 from tuning.lateness import told_lateness
 from tuning.link_energy import LINK_SHARE, fed_back, link_energy

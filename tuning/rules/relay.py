@@ -16,7 +16,8 @@ import numpy as np
 
 from drive_env import cia402, motion
 from drive_env.drives.currents import ampere_per_count, read_current_limit, to_counts
-from drive_env.trials.positioning import CYCLE, wrapped
+from drive_env.drives.interface import CYCLE
+from drive_env.trials.positioning import wrapped
 from mechanics.arrays import Floats, Mask
 from tuning.rules.lags import slow_enough, velocity_lag
 from tuning.rules.optima import take_current

@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count
-from drive_env.drives.interface import Drives, axis_number, machine_of
+from drive_env.drives.interface import CYCLE, Drives, axis_number, machine_of
 from drive_env.drives.observed import ObservedDrives
 from drive_env.drives.raw_gains import read_gains, write_gains
 from drive_env.safety.envelope import SafetyError
 from drive_env.trials.gain_trial import Identified, Trial, measured_cost
 from drive_env.trials.method import method_of
-from drive_env.trials.positioning import CYCLE, PROFILE, SETTLED, TRIAL, longer_way, wrapped, write_profile
+from drive_env.trials.positioning import PROFILE, SETTLED, TRIAL, longer_way, wrapped, write_profile
 from drive_env.trials.score import TRIP
 from mechanics.arrays import Floats, Integers, Mask
 from tuning.fallback_gains import FallbackGains

@@ -10,7 +10,7 @@ import numpy as np
 
 from drive_env import cia402
 from drive_env.drives import motion
-from drive_env.drives.interface import Drives, device_of
+from drive_env.drives.interface import CYCLE, Drives, device_of
 from drive_env.drives.raw_gains import read_gains, write_gains
 from drive_env.loops.dynamics import DEFAULT
 from drive_env.studio.motion_jobs import disable, only, select_mode
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from tuning.target import Target
 
 
-CYCLE = 0.001  # s
 QUIET, LONGEST = 0.02, 10.0  # s at rest before a step; longest move
 AFTER = 0.15  # s that are recorded after a step
 SAFE_TO_STOP = 0.95  # share of a run from which it can no longer be stopped, since its results are being stored
