@@ -283,8 +283,6 @@ def _imitate(run: TrainingRun, model: Any, lanes: CountedEnvironments, report: R
     from agents.policies.baselines import baseline
     from agents.training.imitation import imitate
 
-    if run.algorithm != "ppo":
-        raise HyperparameterError(f"imitate is for ppo only; leave it out with {run.algorithm}")
     name, settings = _named(run.hyperparameters["imitate"])
     teacher = baseline(name, run.environment, lanes.config, int(model.action_space.shape[0]))
 

@@ -59,8 +59,8 @@ def test_it_is_short_and_begins_with_the_two_commands_and_a_picture():
     first, second = SHELLS[:2]
     assert "pip install" in first and "drive-tune auto" in first
     assert "pip install" in second and "pytest" in second
-    (picture,) = re.findall(r"!\[.+\]\((.+)\)", README)
-    assert (ROOT / picture).is_file()
+    pictures = re.findall(r"!\[.+\]\((.+)\)", README)
+    assert len(pictures) == 2 and all((ROOT / picture).is_file() for picture in pictures)
 
 
 @pytest.fixture(scope="module")

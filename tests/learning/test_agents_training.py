@@ -27,7 +27,7 @@ from agents.training import checkpoint, hyperparameters
 from agents.training import train as training
 from agents.training.algorithms import ALGORITHMS
 from agents.training.hyperparameters import HyperparameterError, read_value
-from agents.training.imitation import imitate
+from agents.training.imitation import _windows, imitate
 from agents.training.train import DivergedError, train
 from agents.training.training_run import AGENT, CHECKPOINT, TABLE, TrainingRun
 from tuning.runs import provenance
@@ -181,6 +181,41 @@ class Constant:
 
     def reset(self, mask=None):
         pass
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("algorithm", ["sac", "crossq", "recurrent_ppo"])
+def test_every_algorithm_imitates_and_a_replay_buffer_has_what_the_teacher_saw(algorithm):
+    """With exploration; the critic learns from there what is earned: about a step's reward / (1 - discount)."""
+    steps = 1200
+    kept = {} if algorithm == "recurrent_ppo" else {"buffer_size": 4 * steps, "ent_coef": 0.001}
+    run = tiny(algorithm=algorithm, gamma=0.5, learning_rate=1e-2, **kept)
+    lanes, env = training.make_env(run)
+    model, normaliser = training.make_model(run, env)
+    assert imitate(model, Constant(np.float32([0.3])), seed=1, steps=4 * steps, updates=300) < 0.05
+    seen = normaliser.normalize_obs(lanes.reset(seed=2)[0])
+    acted, _ = model.predict(seen, deterministic=True)
+    lanes.close()
+    assert acted == pytest.approx(0.3, abs=0.1)
+    if not kept:
+        return
+    import torch
+
+    buffer = model.replay_buffer
+    assert buffer.full and buffer.dones.sum() == 4 * steps / 10 and len(np.unique(buffer.observations[:, 0, 0])) > 100
+    assert 0.01 < np.std(buffer.actions) < 0.1 and np.mean(buffer.actions) == pytest.approx(0.3, abs=0.01)
+    assert np.array_equal(buffer.observations[1:9], buffer.next_observations[:8])
+    judged = model.critic(*(torch.as_tensor(rows, dtype=torch.float32) for rows in (seen, acted)))[0].mean().item()
+    assert judged == pytest.approx(buffer.rewards.mean() / (1.0 - model.gamma), rel=0.25)
+
+
+@pytest.mark.parametrize("length", [1, 3])
+def test_windows_of_an_imitation_lie_within_an_episode(length):
+    ends = np.zeros((8, 2), bool)
+    ends[3, 0] = ends[7] = True
+    rows = _windows(ends, length)[:, None] + 2 * np.arange(length)
+    assert len(rows) == {1: 16, 3: 10}[length]
+    assert not ends.ravel()[rows[:, :-1]].any() and np.all(rows % 2 == rows[:, :1] % 2)
 
 
 @pytest.mark.slow

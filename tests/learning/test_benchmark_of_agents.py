@@ -268,19 +268,23 @@ SHIPPED = hyperparameters.FOLDER
 
 @pytest.mark.every(24)
 @pytest.mark.parametrize("task", TASKS)
-def test_the_hyperparameters_that_ship_train_on_every_task(task, tmp_path, monkeypatch):
+@pytest.mark.parametrize("algorithm", ["ppo", "recurrent_ppo", "sac", "crossq"])
+def test_the_hyperparameters_that_ship_train_on_every_task(algorithm, task, tmp_path, monkeypatch):
     monkeypatch.setattr(hyperparameters, "FOLDER", SHIPPED)
-    given = hyperparameters.load(task, "ppo")
-    hyperparameters.merge(given, {"n_envs": 2, "n_timesteps": 16, "n_steps": 8, "batch_size": 16, "n_epochs": 1})
+    given = hyperparameters.load(task, algorithm)
+    small = {"n_steps": 8, "batch_size": 16, "n_epochs": 1} if "ppo" in algorithm else {"learning_starts": 4}
+    hyperparameters.merge(given, {"n_envs": 2, "n_timesteps": 16, **small})
     if given.get("imitate"):
-        given["imitate"] = {"expert": {"steps": 8, "updates": 1}}
-    assert train(TrainingRun(task, "ppo", given), tmp_path).environment == task
+        [teacher] = given["imitate"] if isinstance(given["imitate"], dict) else [given["imitate"]]
+        given["imitate"] = {teacher: {"steps": 8, "updates": 1}}
+    assert train(TrainingRun(task, algorithm, given), tmp_path).environment == task
 
 
 class Recorder:
     """A teacher that is told its machines."""
 
-    def __init__(self):
+    def __init__(self, actions):
+        self.actions = actions
         self.begun = np.zeros(2, int)
         self.inertia = set()
 
@@ -292,19 +296,29 @@ class Recorder:
         pass
 
     def act(self, rows):
-        return np.zeros((len(rows), 1))
+        return np.zeros((len(rows), self.actions))
 
 
-def test_a_teacher_is_told_the_machine_of_each_episode():
-    given = {**hyperparameters.load(TASK, "ppo"), "n_envs": 2}
-    _, env = make_env(TrainingRun(TASK, "ppo", given))
+def taught(task, monkeypatch):
+    """Return what a teacher was told in three episodes of each of two machines."""
+    monkeypatch.setattr(hyperparameters, "FOLDER", SHIPPED)
+    run = TrainingRun(task, "ppo", {**hyperparameters.load(task, "ppo"), "n_envs": 2})
+    _, env = make_env(run)
+    teacher = Recorder(env.action_space.shape[0])
     try:
-        model, _ = make_model(TrainingRun(TASK, "ppo", given), env)
-        teacher = Recorder()
-        imitate(model, teacher, seed=1, steps=2 * (2 * TASKS[TASK].steps + 5), updates=1)
+        imitate(make_model(run, env)[0], teacher, seed=1, steps=2 * (2 * TASKS[task].steps + 5), updates=1)
     finally:
         env.close()
-    assert teacher.begun.tolist() == [3, 3] and len(teacher.inertia) == 6
+    return teacher
+
+
+def test_a_teacher_is_told_the_machine_of_each_episode(monkeypatch):
+    found = taught(TASK, monkeypatch)
+    assert found.begun.tolist() == [3, 3] and len(found.inertia) == 6
+
+
+def test_a_teacher_is_told_of_a_payload_that_changes(monkeypatch):
+    assert len(taught("ServoDrive/PayloadScheduling-v1", monkeypatch).inertia) > 6
 
 
 # --- submitted policies -----------------------------------------------------------------------------------------------

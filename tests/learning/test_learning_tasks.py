@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import hashlib
 import json
+import pickle
 import runpy
 import tomllib
 
@@ -116,6 +118,19 @@ def test_a_nominal_expert_acts_as_the_expert_that_is_told_no_machine(name):
     lanes.close()
     assert (nominal.act(seen) == untold.act(seen)).all()
     assert (nominal.act(seen) != told.act(seen)).any()
+
+
+@pytest.mark.every(11)
+@pytest.mark.parametrize("name", TASKS)
+def test_every_task_has_a_picture_and_goes_on_alike_as_a_copy_or_from_a_file(name):
+    with gymnasium.make(name, render_mode="rgb_array") as env:
+        env.reset(seed=0)
+        env.step(env.action_space.sample())
+        assert env.render().std() > 10.0
+        action = np.zeros(env.action_space.shape, np.float32)
+        others = copy.deepcopy(env.unwrapped), pickle.loads(pickle.dumps(env.unwrapped))
+        first, *stepped = (one.step(action) for one in (env.unwrapped, *others))
+        assert all(np.array_equal(one[0], first[0]) and one[1] == first[1] for one in stepped)
 
 
 def test_an_agents_file_has_the_whole_configuration_of_its_task_and_another_is_refused():

@@ -26,7 +26,7 @@ FOLDER = Path(__file__).parent
 PRESETS = ("quick", "full")
 
 # Keys of the run, as in RL-Zoo; all others go to the algorithm's constructor. Our addition is `imitate`, the name of a
-# baseline that the policy first imitates.
+# baseline that the policy first imitates, with settings of `agents.training.imitation.imitate`.
 RUN_KEYS = ("n_envs", "n_timesteps", "policy", "normalize", "env_kwargs", "vec_env_wrapper", "imitate")
 
 
