@@ -170,6 +170,7 @@ def test_trials_lie_within_the_range_and_the_action_is_a_share_of_the_step(bundl
     assert action == pytest.approx([1.0, 1.0, 1.0])
 
 
+@pytest.mark.slow
 def test_curiosity_seeks_what_is_not_known(bundle, monkeypatch):
     reached = {}
     for curiosity in (0.0, 2.0):

@@ -77,6 +77,7 @@ def test_trusted_lines_lie_on_the_model_also_those_of_the_trace(measured, load):
             assert np.median(np.abs(np.degrees(np.angle(ratio[lines])))) < 4.0
 
 
+@pytest.mark.slow
 def test_images_of_held_set_points_are_taken_out(measured):
     target, plants, gains, response = measured["inertia"]
     # Without that, lines at 300 to 400 Hz would be off by a tenth to a quarter.
