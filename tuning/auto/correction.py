@@ -30,6 +30,7 @@ CORRECTIONS = 2
 UNSEEN = "no loop was measured, so soft dynamics are asked of the model"
 NO_BETTER = "no better as measured: the old ones stay"
 WORTH = 0.85  # of the robust cost on the twins: what is better by less is not worth a correction
+SAME = 0.05  # relative, of the cost of verified gains: what trials of the same gains may differ by
 # Velocity P passes the encoder's noise and counts on to the current, whose swing goes about with its square: what it is
 # lowered to where an axis does not rest; position P likewise where a step overshoots.
 CALMER, LEAST_CALMER = 0.9, 0.5
@@ -88,8 +89,10 @@ def correct(
             recorded = load(bench, basis, recorded, target, changed)
             most = np.where(changed, np.minimum(most, _most_velocity_p(bench, best, recorded)), most)
             if best is not None:
-                # What is no better than what it was to correct goes.
-                no_better = bench.whole_machines(_cost(bench, best) <= _cost(bench, recorded))
+                # What is no better than what it was to correct goes. Where both keep the dynamics and trials cannot
+                # tell, the gains designed by what was measured stay.
+                earlier, later = _cost(bench, best), _cost(bench, recorded)
+                no_better = bench.whole_machines(np.where(later < TRIP, 1.0 + SAME, 1.0) * earlier <= later)
                 # Nothing is known of the loops of either: those designed for more margin stay.
                 no_better &= ~bench.whole_machines(
                     (recorded.failed == "") & np.isnan(best.slack) & np.isnan(recorded.slack)

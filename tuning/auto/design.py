@@ -23,7 +23,7 @@ from drive_env.devices.gains import Part, cascade_columns, si_scales, small_time
 from drive_env.dictionary.roles import Role
 from drive_env.trials.score import robust_cost
 from mechanics.arrays import Floats, Integers, Mask
-from tuning.auto.loop_margins import measured_axis
+from tuning.auto.loop_margins import MEASURED, measured_axis
 from tuning.auto.loop_model import fitted_plant, loop_models, model_of
 from tuning.auto.proving import RESTLESS
 from tuning.auto.twin import WORLDS, Known, Twins, gain_bounds, known_of
@@ -53,6 +53,7 @@ EACH_NOMINAL, EACH = 8, 2
 FINALISTS = 12  # that are tried on all worlds
 STEPS = (1.4, 1.25, 1.18, 1.1, 1.06)  # by which what is best is looked around, gain by gain, up and down
 PROMISING = 32  # of those, that are tried
+FAST_CURRENT = 0.08  # power of torque P that a slow current loop must be worth: on most axes the cost hardly knows it
 FED_FORWARD = np.array([0.3, 0.5, 0.7, 0.85, 1.0])  # of the highest feed-forward: what is tried with the best gains
 SETS, RUNS = 32, 3  # of gains at once on the twins, and runs of each on all worlds
 STILL_FRICTION = WORLDS[1].friction  # over what was identified, of an axis that did not rest
@@ -98,7 +99,8 @@ def design_axes(
         coarse, fine = (Judge(one, models, measured) for one in (one_world, all_worlds))
         found = design(coarse, fine, [one.plant for one in known], say, None if most is None else most[axes])
         if recorded is not None:
-            present[axes] = fine.score(recorded.gains[axes][:, None])[:, 0]
+            # As near to the border as a measurement tells they are as good as inside.
+            present[axes] = fine.score(recorded.gains[axes][:, None], MEASURED)[:, 0]
     gains[axes], cost[axes] = found.gains[:, 0], found.cost[:, 0]
     return gains, cost, present
 
@@ -158,10 +160,15 @@ class Judge(NamedTuple):
             slack[axes] = np.minimum(of_machine, slack[axes].min(axis=0))
         return slack
 
-    def score(self, gains: Integers) -> Floats:
-        """Return the robust cost of raw gains, (n, sets, count): (n, sets)."""
+    def score(self, gains: Integers, allowance: float = 0.0) -> Floats:
+        """Return the robust cost of raw gains, (n, sets, count): (n, sets).
+
+        Args:
+            gains: Of each axis.
+            allowance: By how much they may fall short of the constraints, relative.
+        """
         performance, slack = self.twins.judge(gains)
-        return self.of_machines(robust_cost(performance, np.minimum(slack, self.slack(gains))), np.max)
+        return self.of_machines(robust_cost(performance, np.minimum(slack, self.slack(gains)) + allowance), np.max)
 
     def of_machines(self, values: Floats, reduce: Callable[..., Floats]) -> Floats:
         """Return values of axes, (n, sets), with what their machine makes of them."""
@@ -172,7 +179,7 @@ class Judge(NamedTuple):
 
 
 class Designed(NamedTuple):
-    """What a design found, of every axis, the best first.
+    """What a design found, of every axis, the best first: a slower current loop must be worth it.
 
     gains: Raw, (n, found, count). cost: Robust cost on the twins, (n, found). slack: How far the constraints are kept,
     relative, likewise; below 0 where no gains keep them.
@@ -205,10 +212,14 @@ def design(
         return coarse.of_machines(_promise(device, gains), np.mean)
 
     most = np.full(n, np.inf) if most_velocity_p is None else most_velocity_p
-    column = cascade_columns(device)[2]
+    torque, column = cascade_columns(device)[0], cascade_columns(device)[2]
     pool = np.array([_grid(device, plant, TORQUES) for plant in plants])
-    torque_p = pool[..., cascade_columns(device)[0]].max(axis=1)
+    torque_p = pool[..., torque].max(axis=1)
     pool[..., column] = np.minimum(pool[..., column], most[:, None])
+
+    def worth(gains: Integers, cost: Floats) -> Floats:
+        return coarse.of_machines(cost * (torque_p[:, None] / gains[..., torque]) ** FAST_CURRENT, np.max)
+
     # The best by promise of each bandwidth: first of what keeps the margins as it is, then with its variants.
     for each, nominal in ((EACH_NOMINAL, True), (EACH, False)):
         rows = _of_each(coarse.slack(pool, nominal=nominal), promise(pool), each, len(BANDWIDTHS) * len(TORQUES))
@@ -216,12 +227,12 @@ def design(
         say(0.2)
     cost = coarse.score(pool)
     say(0.4)
-    best = np.argsort(cost, axis=1, kind="stable")[:, :FINALISTS]
+    best = np.argsort(worth(pool, cost), axis=1, kind="stable")[:, :FINALISTS]
     pool = np.take_along_axis(pool, best[:, :, None], axis=1)
     cost = fine.score(pool)
     for number, step in enumerate(STEPS):
         say(0.5 + 0.5 * number / len(STEPS))
-        at = cost.argmin(axis=1)
+        at = worth(pool, cost).argmin(axis=1)
         near = np.array([_around(device, pool[k, at[k]], step, int(torque_p[k])) for k in range(n)])
         near[..., column] = np.minimum(near[..., column], most[:, None])
         slack = coarse.slack(near)
@@ -230,10 +241,11 @@ def design(
         pool, cost = np.concatenate([pool, near], axis=1), np.concatenate([cost, fine.score(near)], axis=1)
     ahead = device.gains.column(*FEED_FORWARD)
     if ahead is not None:
-        fed = np.repeat(np.take_along_axis(pool, cost.argmin(axis=1)[:, None, None], axis=1), len(FED_FORWARD), axis=1)
+        at = worth(pool, cost).argmin(axis=1)
+        fed = np.repeat(np.take_along_axis(pool, at[:, None, None], axis=1), len(FED_FORWARD), axis=1)
         fed[..., ahead] = np.rint(device.gains.rows[ahead].highest * FED_FORWARD)
         pool, cost = np.concatenate([pool, fed], axis=1), np.concatenate([cost, fine.score(fed)], axis=1)
-    order = np.argsort(cost, axis=1, kind="stable")[:, :FINALISTS]
+    order = np.argsort(worth(pool, cost), axis=1, kind="stable")[:, :FINALISTS]
     pool = np.take_along_axis(pool, order[:, :, None], axis=1)
     return Designed(pool, np.take_along_axis(cost, order, axis=1), coarse.slack(pool))
 
