@@ -53,7 +53,6 @@ EACH_NOMINAL, EACH = 8, 2
 FINALISTS = 12  # that are tried on all worlds
 STEPS = (1.4, 1.25, 1.18, 1.1, 1.06)  # by which what is best is looked around, gain by gain, up and down
 PROMISING = 32  # of those, that are tried
-FAST_CURRENT = 0.08  # power of torque P that a slow current loop must be worth: on most axes the cost hardly knows it
 FED_FORWARD = np.array([0.3, 0.5, 0.7, 0.85, 1.0])  # of the highest feed-forward: what is tried with the best gains
 SETS, RUNS = 32, 3  # of gains at once on the twins, and runs of each on all worlds
 STILL_FRICTION = WORLDS[1].friction  # over what was identified, of an axis that did not rest
@@ -179,7 +178,7 @@ class Judge(NamedTuple):
 
 
 class Designed(NamedTuple):
-    """What a design found, of every axis, the best first: a slower current loop must be worth it.
+    """What a design found, of every axis, the best first.
 
     gains: Raw, (n, found, count). cost: Robust cost on the twins, (n, found). slack: How far the constraints are kept,
     relative, likewise; below 0 where no gains keep them.
@@ -212,14 +211,10 @@ def design(
         return coarse.of_machines(_promise(device, gains), np.mean)
 
     most = np.full(n, np.inf) if most_velocity_p is None else most_velocity_p
-    torque, column = cascade_columns(device)[0], cascade_columns(device)[2]
+    column = cascade_columns(device)[2]
     pool = np.array([_grid(device, plant, TORQUES) for plant in plants])
-    torque_p = pool[..., torque].max(axis=1)
+    torque_p = pool[..., cascade_columns(device)[0]].max(axis=1)
     pool[..., column] = np.minimum(pool[..., column], most[:, None])
-
-    def worth(gains: Integers, cost: Floats) -> Floats:
-        return coarse.of_machines(cost * (torque_p[:, None] / gains[..., torque]) ** FAST_CURRENT, np.max)
-
     # The best by promise of each bandwidth: first of what keeps the margins as it is, then with its variants.
     for each, nominal in ((EACH_NOMINAL, True), (EACH, False)):
         rows = _of_each(coarse.slack(pool, nominal=nominal), promise(pool), each, len(BANDWIDTHS) * len(TORQUES))
@@ -227,12 +222,12 @@ def design(
         say(0.2)
     cost = coarse.score(pool)
     say(0.4)
-    best = np.argsort(worth(pool, cost), axis=1, kind="stable")[:, :FINALISTS]
+    best = np.argsort(cost, axis=1, kind="stable")[:, :FINALISTS]
     pool = np.take_along_axis(pool, best[:, :, None], axis=1)
     cost = fine.score(pool)
     for number, step in enumerate(STEPS):
         say(0.5 + 0.5 * number / len(STEPS))
-        at = worth(pool, cost).argmin(axis=1)
+        at = cost.argmin(axis=1)
         near = np.array([_around(device, pool[k, at[k]], step, int(torque_p[k])) for k in range(n)])
         near[..., column] = np.minimum(near[..., column], most[:, None])
         slack = coarse.slack(near)
@@ -241,11 +236,10 @@ def design(
         pool, cost = np.concatenate([pool, near], axis=1), np.concatenate([cost, fine.score(near)], axis=1)
     ahead = device.gains.column(*FEED_FORWARD)
     if ahead is not None:
-        at = worth(pool, cost).argmin(axis=1)
-        fed = np.repeat(np.take_along_axis(pool, at[:, None, None], axis=1), len(FED_FORWARD), axis=1)
+        fed = np.repeat(np.take_along_axis(pool, cost.argmin(axis=1)[:, None, None], axis=1), len(FED_FORWARD), axis=1)
         fed[..., ahead] = np.rint(device.gains.rows[ahead].highest * FED_FORWARD)
         pool, cost = np.concatenate([pool, fed], axis=1), np.concatenate([cost, fine.score(fed)], axis=1)
-    order = np.argsort(worth(pool, cost), axis=1, kind="stable")[:, :FINALISTS]
+    order = np.argsort(cost, axis=1, kind="stable")[:, :FINALISTS]
     pool = np.take_along_axis(pool, order[:, :, None], axis=1)
     return Designed(pool, np.take_along_axis(cost, order, axis=1), coarse.slack(pool))
 
