@@ -38,18 +38,18 @@ def gains_of(velocity_p):
 class Ground:
     """Drives on which gains pass their trial unless `fails` says otherwise."""
 
-    def __init__(self, fails):
-        self.fails, self.tried = fails, []
+    def __init__(self, fails, cost=1.0):
+        self.fails, self.cost, self.tried = fails, cost, []
 
     def run(self, gains, where):
         self.tried.append(gains[:, VELOCITY_P].tolist())
         n = len(gains)
         reason = tuple("it shook" if self.fails(p) else "" for p in gains[:, VELOCITY_P])
-        return Proof(np.ones(n), reason, np.array(reason) != "")
+        return Proof(np.full(n, self.cost), reason, np.array(reason) != "")
 
 
 def corrected(monkeypatch, wanted, *, slack=None, fails=lambda p: False, failed=None, overshoot=None, axes=1,
-              seconds=99, measured=True, time_waits=True):  # fmt: skip
+              seconds=99, measured=True, time_waits=True, cost=1.0):  # fmt: skip
     """Return what correction leaves of gains with a velocity P of 1000, the drives, and what was verified.
 
     Args:
@@ -62,6 +62,7 @@ def corrected(monkeypatch, wanted, *, slack=None, fails=lambda p: False, failed=
         seconds: Drive time that is left.
         measured: Whether there is a frequency response.
         time_waits: Whether twins may be asked meanwhile.
+        cost: Of a trial of corrected gains; that of the first ones is 1.
     """
     designs, verified = list(wanted), []
 
@@ -93,7 +94,7 @@ def corrected(monkeypatch, wanted, *, slack=None, fails=lambda p: False, failed=
     monkeypatch.setattr(correction, "load", lambda bench, basis, recorded, target, where: recorded)
     axis = SimpleNamespace(slack=lambda dynamics, gains: np.array([slack(p) for p in gains[:, VELOCITY_P]]))
     monkeypatch.setattr(correction, "measured_axis", lambda *given: axis if measured else None)
-    bench = bench_of(axes, Ground(fails), seconds, time_waits)
+    bench = bench_of(axes, Ground(fails, cost), seconds, time_waits)
     tried = vary(RecordedGains.only(np.array([FIRST] * axes)), proof=np.ones(axes), cost=np.ones(axes))
     found = correct(bench, basis(tried.gains), tried, bench.target, lambda what, share: None)
     return found, bench, verified
@@ -247,6 +248,19 @@ def test_corrected_gains_that_are_worse_on_the_drive_are_not_kept(monkeypatch):
     found, bench, verified = corrected(monkeypatch, [900, 800], slack=lambda p: p / 1000.0 - 1.1)
     assert verified == [[1000], [900], [800]] and found.gains.tolist() == [FIRST]
     assert found.slack == pytest.approx([-0.1]) and not bench.journals[0].reason, "the verdict on it is the margins'"
+
+
+@pytest.mark.parametrize(("cost", "left"), [(0.9, 800), (1.03, 800), (1.1, 1000)])
+def test_where_trials_cannot_tell_the_gains_designed_by_what_was_measured_stay(cost, left, monkeypatch):
+    """The noise of a trial does not decide between two designs."""
+    found, _, verified = corrected(monkeypatch, [800, 800], slack=lambda p: -0.02 if p == 1000 else 0.1, cost=cost)
+    assert verified[:2] == [[1000], [800]] and found.gains[0, VELOCITY_P] == left
+
+
+@pytest.mark.parametrize(("later", "left"), [(-0.11, 1000), (-0.09, 900)])
+def test_of_gains_that_break_the_constraints_those_that_do_by_less_stay(later, left, monkeypatch):
+    found, _, _ = corrected(monkeypatch, [900, 900], slack=lambda p: -0.1 if p == 1000 else later)
+    assert found.gains[0, VELOCITY_P] == left
 
 
 def test_corrected_gains_that_fail_their_trial_leave_those_before(monkeypatch):

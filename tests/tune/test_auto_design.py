@@ -188,6 +188,7 @@ def test_the_design_is_made_for_the_worst_of_measurement_and_model():
     rows = sets(300, 500, 1000)[None]
     assert both.slack(rows)[0] == pytest.approx([0.25, -0.25, -1.5])
     assert (both.score(rows)[0] < 30.0).tolist() == [True, False, False]
+    assert (both.score(rows, 0.3)[0] < 30.0).tolist() == [True, True, False]
 
 
 def test_axes_of_one_machine_have_one_slack_and_the_worst_cost():

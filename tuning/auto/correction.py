@@ -30,6 +30,7 @@ CORRECTIONS = 2
 UNSEEN = "no loop was measured, so soft dynamics are asked of the model"
 NO_BETTER = "no better as measured: the old ones stay"
 WORTH = 0.85  # of the robust cost on the twins: a smaller improvement is not worth a correction
+SAME = 0.05  # relative difference of cost that two trials of the same gains may have
 # Velocity P amplifies noise and resolution of the encoder to the current, whose ripple grows with about its square:
 # factor limits of velocity P of an axis that is not at rest, and of position P if a step overshoots.
 CALMER, LEAST_CALMER = 0.9, 0.5
@@ -89,8 +90,10 @@ def correct(
             recorded = load(bench, basis, recorded, target, changed)
             most = np.where(changed, np.minimum(most, _most_velocity_p(bench, best, recorded)), most)
             if best is not None:
-                # Corrected gains that are no better than the ones before them are taken back.
-                no_better = bench.whole_machines(_cost(bench, best) <= _cost(bench, recorded))
+                # Corrected gains that are no better than the ones before them are taken back. If both keep the
+                # dynamics and their trials differ by less than noise, the corrected ones stay.
+                earlier, later = _cost(bench, best), _cost(bench, recorded)
+                no_better = bench.whole_machines(np.where(later < TRIP, 1.0 + SAME, 1.0) * earlier <= later)
                 # If neither loop could be measured, the gains designed for more margin stay.
                 no_better &= ~bench.whole_machines(
                     (recorded.failed == "") & np.isnan(best.slack) & np.isnan(recorded.slack)

@@ -24,7 +24,7 @@ from drive_env.devices.gains import Part, cascade_columns, si_scales, small_time
 from drive_env.dictionary.roles import Role
 from drive_env.trials.score import robust_cost
 from mechanics.arrays import Floats, Integers, Mask
-from tuning.auto.loop_margins import measured_axis
+from tuning.auto.loop_margins import MEASURED, measured_axis
 from tuning.auto.loop_model import fitted_plant, loop_models, model_of
 from tuning.auto.proving import RESTLESS
 from tuning.auto.twin import WORLDS, Known, Twins, gain_bounds, known_of
@@ -100,7 +100,8 @@ def design_axes(
         coarse, fine = (Judge(one, models, measured) for one in (one_world, all_worlds))
         found = design(coarse, fine, [one.plant for one in known], say, None if most is None else most[axes])
         if recorded is not None:
-            present[axes] = fine.score(recorded.gains[axes][:, None])[:, 0]
+            # As near to the border as a measurement tells they are as good as inside.
+            present[axes] = fine.score(recorded.gains[axes][:, None], MEASURED)[:, 0]
     gains[axes], cost[axes] = found.gains[:, 0], found.cost[:, 0]
     return gains, cost, present
 
@@ -161,10 +162,15 @@ class Judge(NamedTuple):
             slack[axes] = np.minimum(of_machine, slack[axes].min(axis=0))
         return slack
 
-    def score(self, gains: Integers) -> Floats:
-        """Return the robust cost of raw gains, (n, sets, count): (n, sets)."""
+    def score(self, gains: Integers, allowance: float = 0.0) -> Floats:
+        """Return the robust cost of raw gains, (n, sets, count): (n, sets).
+
+        Args:
+            gains: Of each axis.
+            allowance: By how much they may fall short of the constraints, relative.
+        """
         performance, slack = self.twins.judge(gains)
-        return self.of_machines(robust_cost(performance, np.minimum(slack, self.slack(gains))), np.max)
+        return self.of_machines(robust_cost(performance, np.minimum(slack, self.slack(gains)) + allowance), np.max)
 
     def of_machines(self, values: Floats, reduce: Callable[..., Floats]) -> Floats:
         """Replace the values of axes, (n, sets), by their machine's, reduced over its axes."""
