@@ -65,8 +65,6 @@ LACKS = {
     "they begin as, which knows the rope and the mass.",
     "PoleBalance-v1": "as Crane-v1; a fall ends the episode besides.",
     "PoleSwingUp-v1": "as PoleBalance-v1, after a swing-up that earns hardly anything before it succeeds.",
-    "StepperRun-v1": "the highest speed differs from machine to machine and shows where steps are lost, which ends the "
-    "episode. The oracle knows it.",
     "PayloadScheduling-v1": "the expert knows the payload, which an agent sees in currents and errors alone.",
     "KnownPayload-v1": "the expert's schedule is near the least lag that the margins allow.",
     "ServoTuning-v1": "the expert computes the margins of each machine's true model; an agent has ten trials of it, "

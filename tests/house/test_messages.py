@@ -1,4 +1,4 @@
-"""docs/messages.md has a row for each message that leaves a question, and none that the code has no more."""
+"""docs/messages.md has a row for each message that needs an explanation; each row names a message of the code."""
 
 from __future__ import annotations
 

@@ -482,7 +482,7 @@ def test_a_recorded_move_says_how_far_the_emulator_lies_from_it(tmp_path):
     ("arguments", "message"),
     [
         (("nowhere.npz",), "there is no file nowhere.npz"),
-        (("agent.tflite",), "or a baseline (cascade, expert, feed_forward, nothing, oracle, rest, "),
+        (("agent.tflite",), "or a baseline (cascade, expert, feed_forward, nominal, nothing, oracle, rest, "),
         (("feed_forward", "-e", "tracking"), "adds to the profile, and action is 'direct'"),
         (("state_feedback", "-e", "tracking"), "is for load inverted_pendulum, mode cst and action direct alone"),
         (("nowhere:policy",), "module 'nowhere' cannot be imported"),

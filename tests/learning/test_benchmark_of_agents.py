@@ -245,7 +245,7 @@ def test_ctrl_c_leaves_what_is_complete(tmp_path, monkeypatch):
     monkeypatch.setattr(runs, "_made", interrupted)
     found = run("--task", TASK, "--seeds", 1, "--out", tmp_path / "bench")
     assert found.exit_code == 130 and "continue with --resume" in found.output
-    assert {name.split("/")[1] for name in rows_of(tmp_path / "bench")} == {"rest", "cascade", "expert"}
+    assert {name.split("/")[1] for name in rows_of(tmp_path / "bench")} == {"rest", "cascade", "expert", "nominal"}
 
 
 def test_another_benchmark_is_not_mixed_in(benchmark):
@@ -300,7 +300,7 @@ class Recorder:
 
 
 def taught(task, monkeypatch):
-    """Return what a teacher was told in three episodes of each of two machines."""
+    """Return the teacher after three episodes of each of two environments."""
     monkeypatch.setattr(hyperparameters, "FOLDER", SHIPPED)
     run = TrainingRun(task, "ppo", {**hyperparameters.load(task, "ppo"), "n_envs": 2})
     _, env = make_env(run)

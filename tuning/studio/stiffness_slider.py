@@ -34,7 +34,7 @@ class StiffnessSlider:
 
     @property
     def designed(self) -> SoftToStiff | str:
-        """The gains of the slider, or the reason why there are none."""
+        """The gains of the slider, or the reason why no gains were found."""
         desk, axis = self._panel.desk, self._panel.axis
         if ("velocity", axis) not in desk.responses:
             return "No response of the velocity loop yet: press Measure, and the slider has gains from soft to stiff."
