@@ -55,7 +55,12 @@ def test_increments_follow_the_scale_and_are_no_unit_where_it_is_not_known():
     for name, dimension in (("inc", "angle"), ("pps", "speed"), ("pps^2", "acceleration")):
         assert find_unit(name, TURN) == (dimension, 1 / TURN)
         assert find_unit(name, None) is None and find_unit(name, 0.0) is None
-    assert find_unit("furlong", TURN) is None
+    assert find_unit("furlong", TURN) is None and find_unit("10 furlong", TURN) is None
+
+
+def test_a_multiple_of_a_unit_is_one():
+    assert find_unit("10 rpm", None) == ("speed", pytest.approx(10 / 60))
+    assert find_unit("10 pps", TURN) == ("speed", pytest.approx(10 / TURN))
 
 
 @every_row(

@@ -6,6 +6,7 @@ import csv
 import importlib.metadata
 import json
 import tomllib
+from functools import partial
 
 import numpy as np
 import pytest
@@ -29,6 +30,7 @@ from tuning.runs.pools import open_pool
 from tuning.runs.shard_log import ShardLog
 from tuning.search.optimise import Optimised, Settings, TrialRow
 from tuning.search.trials_files import trials_figure
+from tuning.target import emulated
 
 RIGID = [m for m in load_suite() if m.load == "inertia" and m.motor == "qbl4208"]
 SHORT = [m for m in load_suite() if m.load == "belt"][-1:]
@@ -121,7 +123,7 @@ def test_gains_are_judged_by_the_dynamics_asked_for():
         assert soft.robust_cost > 30.0 > standard.robust_cost
 
 
-def test_auto_is_asked_for_the_dynamics_and_no_other_tuner(monkeypatch):
+def test_auto_is_asked_for_the_dynamics(monkeypatch):
     asked = {}
 
     def auto(target, file, *, dynamics, keep):
@@ -131,7 +133,21 @@ def test_auto_is_asked_for_the_dynamics_and_no_other_tuner(monkeypatch):
     monkeypatch.setattr("tuning.auto.one_button.auto", auto)
     compare(RIGID[:1], {"auto": find_tuner("auto", dynamics="soft")}, oracles=find_oracles(RIGID[:1]))
     assert asked == {"dynamics": "soft"}
-    assert find_tuner("tpe", 5, "soft").keywords == find_tuner("tpe", 5).keywords
+
+
+@pytest.mark.slow
+def test_a_search_keeps_the_dynamics_asked_for():
+    best = find_oracles(RIGID[:2])
+    named = {"asked": find_tuner("tpe", 6, "soft"), "free": partial(search_tuner, sampler="tpe", trials=6)}
+    found = compare(RIGID[:2], named, oracles=best, dynamics="soft")
+    assert all(row.near and row.phase_deg > 55.0 for row in found.of("asked"))
+    assert not any(row.near for row in found.of("free"))
+
+
+def test_a_search_of_a_drive_without_a_linear_model_has_no_margins_to_keep():
+    with emulated("tmcm6212", "inertia") as target:
+        kept = search_tuner(target, np.random.default_rng(0), "standard", sampler="random", trials=1)
+    assert kept.moves.all()
 
 
 @pytest.mark.slow

@@ -66,9 +66,9 @@ def rank(
     Robust performance counts speed, stiffness, noise and overshoot on the machine and its variants: the lower the
     better. It is given over that of the oracle, the best gains of that machine that keep the constraints. The share of
     machines that keep them and the true margins of the loops are given, too. --dynamics says what the constraints are,
-    and auto is asked for them; oracles for other than standard ones are searched first. Writes tuners.csv, rivals.csv,
-    machines.csv, comparison.png and settings.toml, and copies files of your own (suite, motors, loads) to inputs/. A
-    stopped run continues with --out and --resume, with identical results; also with --workers and --cluster.
+    and auto and the searches keep them; oracles for other than standard ones are searched first. Writes tuners.csv,
+    rivals.csv, machines.csv, comparison.png and settings.toml, and copies files of your own (suite, motors, loads) to
+    inputs/. A stopped run continues with --out and --resume, with identical results; also with --workers and --cluster.
     """
     with errors_as_exit_codes():
         if show:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from drive_env.devices.gains import has_linear_model
 from drive_env.drives.raw_gains import read_gains, write_gains
 from drive_env.loops.dynamics import DEFAULT
 from mechanics.arrays import Integers
@@ -24,7 +25,6 @@ from tuning.search.trial_bench import TrialBench
 from tuning.target import Target, timed
 
 if TYPE_CHECKING:
-    from drive_env.loops.dynamics import Dynamics
     from drive_env.loops.linear_model import Plant
     from tuning.rules.proposal import Proposal
 
@@ -36,7 +36,7 @@ class TunerKind(NamedTuple):
 
     slow: Runs only if it is named.
     searches: `make` takes the number of trials.
-    asked: `make` takes the dynamics.
+    asked: `make` takes the dynamics, and the tuner keeps them.
     """
 
     name: str
@@ -67,7 +67,7 @@ def tuner_rows() -> dict[str, TunerKind]:
     return rows
 
 
-def find_tuner(name: str, trials: int | None = None, dynamics: str | Dynamics = DEFAULT) -> Tuner:
+def find_tuner(name: str, trials: int | None = None, dynamics: str = DEFAULT) -> Tuner:
     """Look up a tuner by name.
 
     Args:
@@ -82,9 +82,10 @@ def find_tuner(name: str, trials: int | None = None, dynamics: str | Dynamics = 
     if name not in rows:
         raise MissingTunerError(f"no tuner is named {name!r}; there are {', '.join(rows)}")
     row = rows[name]
-    if row.asked:
-        return row.make(dynamics)
-    return row.make(trials=trials) if row.searches and trials is not None else row.make()
+    options: dict[str, Any] = {"dynamics": dynamics} if row.asked else {}
+    if row.searches and trials is not None:
+        options["trials"] = trials
+    return row.make(**options)
 
 
 # --- tuners without a search ------------------------------------------------------------------------------------------
@@ -148,24 +149,34 @@ def _rules() -> Mapping[str, Callable[..., Proposal]]:
     return RULES
 
 
-def _auto(dynamics: str | Dynamics) -> Tuner:
+def _auto(dynamics: str) -> Tuner:
     return partial(importlib.import_module("tuning.auto.one_button").tune, dynamics=dynamics)
 
 
 # --- searches ---------------------------------------------------------------------------------------------------------
-def search_tuner(target: Target, rng: np.random.Generator, **settings: Any) -> Outcome:
-    """Search gains by trials; `settings` are fields of `optimise.Settings`."""
-    found = optimise(target, Settings(seed=int(rng.integers(2**31)), **settings))
+def search_tuner(target: Target, rng: np.random.Generator, dynamics: str | None = None, **settings: Any) -> Outcome:
+    """Search gains by trials that keep the dynamics by the model, of drives with a linear one.
+
+    `settings` are fields of `optimise.Settings`.
+    """
+    kept = dynamics if has_linear_model(target.device) else None
+    found = optimise(target, Settings(seed=int(rng.integers(2**31)), dynamics=kept, **settings))
     notes = tuple(note for note in found.notes for _ in range(target.axes_per_machine))
     return _outcome(target, found.gains, found.drive_seconds, moves=found.moves, aborts=found.aborts, notes=notes)
 
 
-def _search(sampler: str, trials: int, safe: bool = False) -> Tuner:
+def _search(sampler: str, trials: int, safe: bool = False, dynamics: str = DEFAULT) -> Tuner:
     try:
         check_installed(sampler)
     except ValueError as error:
         raise MissingTunerError(str(error)) from None
-    return partial(search_tuner, sampler=sampler, trials=trials, safe=safe)
+    return partial(search_tuner, sampler=sampler, trials=trials, safe=safe, dynamics=dynamics)
+
+
+def _searching(name: str, meaning: str, sampler: str, trials: int, safe: bool = False) -> TunerKind:
+    """Return the row of a search."""
+    make = partial(_search, sampler, trials=trials, safe=safe)
+    return TunerKind(name, meaning, make, searches=True, asked=True)
 
 
 def _load(entry: importlib.metadata.EntryPoint) -> Tuner:
@@ -184,17 +195,14 @@ _OWN = (
 )
 _AFTER = (
     TunerKind("auto", "drive-tune auto: identify, design on twins, try, verify, correct", _auto, asked=True),
-    TunerKind("random", "20 trials drawn at random", partial(_search, "random", trials=20), searches=True),
-    TunerKind("grid", "the baseline rule and a grid of 27 trials", partial(_search, "grid", trials=28)),
-    TunerKind("tpe", "20 trials by tree-structured Parzen estimators",
-        partial(_search, "tpe", trials=20), searches=True),
-    TunerKind("tpe-safe", "20 trials by TPE from safe gains, in small steps",
-        partial(_search, "tpe", trials=20, safe=True),
-        searches=True),
-    TunerKind("cmaes", "20 trials by CMA-ES", partial(_search, "cmaes", trials=20), searches=True),
-    TunerKind("gp", "12 trials by a Gaussian process", partial(_search, "gp", trials=12), slow=True, searches=True),
-    TunerKind("gp-safe", "12 trials by a Gaussian process from safe gains, in small steps",
-        partial(_search, "gp", trials=12, safe=True), slow=True, searches=True),
+    _searching("random", "20 trials drawn at random", "random", 20),
+    _searching("grid", "the baseline rule and a grid of 27 trials", "grid", 28)._replace(searches=False),
+    _searching("tpe", "20 trials by tree-structured Parzen estimators", "tpe", 20),
+    _searching("tpe-safe", "20 trials by TPE from safe gains, in small steps", "tpe", 20, safe=True),
+    _searching("cmaes", "20 trials by CMA-ES", "cmaes", 20),
+    _searching("gp", "12 trials by a Gaussian process", "gp", 12)._replace(slow=True),
+    _searching("gp-safe", "12 trials by a Gaussian process from safe gains, in small steps", "gp", 12,
+               safe=True)._replace(slow=True),
 )  # fmt: skip
 
 
