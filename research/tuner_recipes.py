@@ -89,8 +89,8 @@ _TMCM1636 = Recipe(
     limits=(
         "velocity P and I and position P only",
         "too cautious on rigid axes: its answers cost more there than the baseline rule's",
-        "drive-tune auto, which designs gains on models of the machine, is better: this agent shows what "
-        "learning reaches",
+        "drive-tune auto, which designs gains on models of the machine, is better, and so are searches by as many "
+        "trials with the same constraints (--by cmaes, gp, tpe): this agent shows what learning reaches",
     ),
 )
 
