@@ -206,7 +206,11 @@ def integers(text: str, entry: Entry, scale: Sequence[Scale], where: Mask | None
         ValueError: As `parse` does.
     """
     chosen = np.ones(len(scale), bool) if where is None else where
-    return np.array([parse(text, entry, one) if mine else 0 for one, mine in zip(scale, chosen, strict=True)], np.int64)
+    found = [parse(text, entry, one) if mine else 0 for one, mine in zip(scale, chosen, strict=True)]
+    try:
+        return np.array(found, np.int64)
+    except OverflowError:
+        raise ValueError(_too_large(text, entry)) from None
 
 
 def in_unit(raw: Integers, entry: Entry, unit: str, scale: Sequence[Scale]) -> Floats:

@@ -108,6 +108,10 @@ def test_each_axis_has_its_own_scale_and_the_others_none():
     assert integers("0.5 rev/s", entry("pps"), scale, where).tolist() == [500, 0, 1000]
     with pytest.raises(ValueError, match="has no unit"):
         integers("0.5 rev/s", entry("pps"), scale)
+    with pytest.raises(
+        ValueError, match=r"'1e30 rev/s' is beyond any number; .* takes -2147483648 to 2147483647 in pps"
+    ):
+        integers("1e30 rev/s", entry("pps"), [TURN])
 
 
 def test_integers_in_a_unit():
