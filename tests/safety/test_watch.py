@@ -50,7 +50,7 @@ def watch_of(
 
     def stop_for(what, remedy):
         done.stopped.append(what)
-        raise SafetyError(what)
+        raise SafetyError(f"{what}; {remedy}")
 
     drives = SimpleNamespace(
         nodes=nodes, num_axes=axes, time_waits=time_waits, must_start=count("started"),
@@ -356,7 +356,7 @@ class Bench:
 
     def _stop_for(self, what, remedy):
         self.done.append(("stop_for", what, remedy))
-        raise SafetyError(what)
+        raise SafetyError(f"{what}; {remedy}")
 
     def supervised(self, is_this_thread=False):
         """Have a supervisor; return how often it was woken."""
