@@ -134,6 +134,8 @@ def _asked_for(one: OneAxis, speed: str, by: str | None, duration: float) -> _Mo
         raise ValueError(f"--by {by} is less than one increment: nothing would move; give more")
     if distance is not None and velocity < 0 < distance:
         raise ValueError(f"{speed} turns the other way than --by {by}; leave out one sign, the distance's counts")
+    if distance is not None:
+        one.check_target(one.position() + distance)
     one.check_acceleration(one.mode if by is None else "pp")
     return _Movement(velocity, duration, distance)
 

@@ -72,6 +72,7 @@ def move(
             one.check_acceleration("pp")
             start = one.read(cia402.POSITION_ACTUAL)
             target = start + goal if relative else goal
+            one.check_target(target)
             way = target - start
             what = f"moved by {one.show(way)} to {one.show(target)}"
             what += f" at {one.show(velocity, cia402.PROFILE_VELOCITY)}"

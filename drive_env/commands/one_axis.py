@@ -209,6 +209,12 @@ class OneAxis:
             [f"{self.name} is {here}({status:04X}h) and would be enabled, {what}, and be switched off again{end}"]
         )
 
+    def check_target(self, target: int) -> None:
+        """Raise ObjectAccessError for a position, say of a relative move, that 607Ah does not hold."""
+        from drive_env.dictionary.access import check_limits
+
+        check_limits(self.drives.description.dictionary.find(cia402.TARGET_POSITION), target)
+
     def check_acceleration(self, mode: str) -> None:
         """Raise ValueError where the acceleration of a mode is 0: nothing would move."""
         key, name, example = ACCELERATION[mode]
@@ -263,7 +269,8 @@ def limits_of(
             f"--max-current: {description.name} has no current limit in amperes that could be set for the movement; "
             f"leave it out, and set the drive's own current{own}"
         )
-    entry, scales = description.dictionary.find(cia402.TORQUE_ACTUAL), [None] * description.num_axes
+    entry = description.dictionary.find(cia402.TORQUE_ACTUAL)
+    scales: list[Scale] = [None] * description.num_axes
     if quantities.follows_scale(entry.unit):
         with bus.connect(eds, safety=False) as drives:
             scales = scales_of(drives)
