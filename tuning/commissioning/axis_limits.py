@@ -123,7 +123,7 @@ def check_place_of_axes(target: Target) -> None:
         return
     least, most, here = (target.drives.read(key) for key in (low, high, cia402.POSITION_ACTUAL))
     for axis, a, b, x in zip(target.axis_numbers, least.tolist(), most.tolist(), here.tolist(), strict=True):
-        if a >= b and (a, b) != (0, 0):  # which are none
+        if a >= b and (a, b) != (0, 0):  # 0 and 0: no limits
             raise ValueError(
                 f"axis {axis}: the highest position {b} is not above the lowest {a} (607Dh): give `lowest` and "
                 "`highest` from home"
