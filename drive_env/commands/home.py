@@ -103,9 +103,9 @@ def home(
         check_time("--within", within)
         if not description.has(cia402.HOMING_METHOD):
             raise ValueError(f"{description.name} has no homing: its EDS lacks 6098h")
-        limits = limits_of(description, max_current, bus.interface, no_watchdog=no_watchdog)
         if dry_run:
             bus.look_first(eds)
+        limits = limits_of(bus, eds, description, bus.axes, max_current, no_watchdog=no_watchdog)
         with bus.connect(eds, safety=limits, cycle=cycle_for(description)) as drives:
             plan = [_planned(OneAxis(drives, axis), method, json) for axis in bus.axes]
             for homing in plan:

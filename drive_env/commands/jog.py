@@ -61,20 +61,20 @@ def jog(
     """Enable an axis, turn it for a while or by a distance, and switch it off again.
 
     The safety envelope is on: Ctrl-C, an exceeded limit and the end of this process all cause a quick stop. A negative
-        speed turns the other way. A drive without pv turns in vl. Exit code 1 if the movement was stopped, or the axis
-        did not move.
+    speed turns the other way; with --by the sign of the distance does. A drive without pv turns in vl. Exit code 1 if
+    the movement was stopped, or the axis did not move.
     """
     with errors_as_exit_codes():
         from drive_env.fieldbus.description import describe
 
         description = describe(bus.device, eds)
         check_axis(description, bus.one_axis)
-        limits = limits_of(description, max_current, bus.interface, no_watchdog=no_watchdog)
+        if dry_run:
+            bus.look_first(eds)
+        limits = limits_of(bus, eds, description, [bus.one_axis], max_current, no_watchdog=no_watchdog)
         if not 0.001 <= duration <= 3600.0:
             raise ValueError(f"--for {duration:g} s must be at least 0.001 s and at most an hour")
         files = None if out is None else new_files(out)
-        if dry_run:
-            bus.look_first(eds)
         with bus.connect(eds, safety=limits, cycle=cycle_for(description)) as drives:
             one = OneAxis(drives, bus.one_axis)
             movement = _asked_for(one, speed, by, duration)
@@ -130,6 +130,12 @@ def _asked_for(one: OneAxis, speed: str, by: str | None, duration: float) -> _Mo
     if by is not None and not (one.has_position and one.drives.description.has(cia402.TARGET_POSITION)):
         raise ValueError(f"--by {by}: {one.drives.description.name} has no position to move to; use --for")
     distance = None if by is None else one.parse(by, cia402.TARGET_POSITION)
+    if distance == 0:
+        raise ValueError(f"--by {by} is less than one increment: nothing would move; give more")
+    if distance is not None and velocity < 0 < distance:
+        raise ValueError(f"{speed} turns the other way than --by {by}; leave out one sign, the distance's counts")
+    if distance is not None:
+        one.check_target(one.position() + distance)
     one.check_acceleration(one.mode if by is None else "pp")
     return _Movement(velocity, duration, distance)
 

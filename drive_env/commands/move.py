@@ -62,16 +62,17 @@ def move(
 
         description = describe(bus.device, eds)
         check_axis(description, bus.one_axis)
-        limits = limits_of(description, max_current, bus.interface, no_watchdog=no_watchdog)
-        files = None if out is None else new_files(out)
         if dry_run:
             bus.look_first(eds)
+        limits = limits_of(bus, eds, description, [bus.one_axis], max_current, no_watchdog=no_watchdog)
+        files = None if out is None else new_files(out)
         with bus.connect(eds, safety=limits, cycle=cycle_for(description)) as drives:
             one = OneAxis(drives, bus.one_axis)
             goal, velocity = one.parse(position, cia402.TARGET_POSITION), _velocity(one, speed)
             one.check_acceleration("pp")
             start = one.read(cia402.POSITION_ACTUAL)
             target = start + goal if relative else goal
+            one.check_target(target)
             way = target - start
             what = f"moved by {one.show(way)} to {one.show(target)}"
             what += f" at {one.show(velocity, cia402.PROFILE_VELOCITY)}"

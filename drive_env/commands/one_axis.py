@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from drive_env import cia402
-from drive_env.commands.options import axis_name, print_json, scales_of
+from drive_env.commands.options import NodeOptions, axis_name, default_samples, print_json, scales_of
 from drive_env.commands.scope import default_names, draw, write_table
 from drive_env.commands.tables import print_lines
 
@@ -209,6 +209,12 @@ class OneAxis:
             [f"{self.name} is {here}({status:04X}h) and would be enabled, {what}, and be switched off again{end}"]
         )
 
+    def check_target(self, target: int) -> None:
+        """Raise ObjectAccessError for a position, say of a relative move, that 607Ah does not hold."""
+        from drive_env.dictionary.access import check_limits
+
+        check_limits(self.drives.description.dictionary.find(cia402.TARGET_POSITION), target)
+
     def check_acceleration(self, mode: str) -> None:
         """Raise ValueError where the acceleration of a mode is 0: nothing would move."""
         key, name, example = ACCELERATION[mode]
@@ -220,8 +226,8 @@ class OneAxis:
 
 
 def _recorded(known: ObjectDictionary) -> list[cia402.Key]:
-    """Return the objects that are recorded of a movement: those of scope that the drive has."""
-    return [key for name in default_names(known) if known.has(key := (int(name, 16), 0))]
+    """Return the objects that are recorded of a movement: those of scope that the drive can send with every cycle."""
+    return [(int(name, 16), 0) for name in default_samples(known, default_names(known))]
 
 
 def check_axis(description: Description, axis: int) -> None:
@@ -230,8 +236,14 @@ def check_axis(description: Description, axis: int) -> None:
         raise ValueError(f"--axis {axis}: a {description.name} has {description.num_axes} axes, from 0")
 
 
-def limits_of(description: Description, max_current: str | None, interface: str | None, *, no_watchdog: bool) -> Limits:
-    """Return the envelope's limits for --max-current and --no-watchdog; ValueError for an impossible value."""
+def limits_of(
+    bus: NodeOptions, eds: Path | None, description: Description, axes: list[int], max_current: str | None,
+    *, no_watchdog: bool,
+) -> Limits:  # fmt: skip
+    """Return the envelope's limits for --max-current of axes and --no-watchdog; ValueError for an impossible value.
+
+    Where currents are counted in those of the motor, these are read from the drive.
+    """
     from drive_env.dictionary import quantities
     from drive_env.dictionary.roles import Role
     from drive_env.drives.limits import Limits
@@ -240,7 +252,7 @@ def limits_of(description: Description, max_current: str | None, interface: str 
     limits = Limits()
     if no_watchdog:
         has = [index for index in WATCHDOGS if description.has((index, 0)) or description.has((index, 1))]
-        if has or is_ethercat(interface):
+        if has or is_ethercat(bus.interface):
             what = f"{has[0]:04X}h" if has else "that of its process data"
             raise ValueError(
                 f"--no-watchdog: a {description.name} has a watchdog over its master ({what}), and is not moved "
@@ -257,8 +269,15 @@ def limits_of(description: Description, max_current: str | None, interface: str 
             f"--max-current: {description.name} has no current limit in amperes that could be set for the movement; "
             f"leave it out, and set the drive's own current{own}"
         )
-    current = quantities.parse(max_current, description.dictionary.find(cia402.TORQUE_ACTUAL), None)
-    if current <= 0:
+    entry = description.dictionary.find(cia402.TORQUE_ACTUAL)
+    scales: list[Scale] = [None] * description.num_axes
+    if quantities.follows_scale(entry.unit):
+        with bus.connect(eds, safety=False) as drives:
+            scales = scales_of(drives)
+    current = [
+        quantities.parse(max_current, entry, scale) if axis in axes else None for axis, scale in enumerate(scales)
+    ]
+    if any(one is not None and one <= 0 for one in current):
         raise ValueError(f"--max-current {max_current} must be above 0 A; leave it out for the drive's own limit")
     return replace(limits, current=current)
 

@@ -97,7 +97,7 @@ def diff(
     """Show where a drive, or another file, differs from a file; exit code 1 if it does."""
     from drive_env.fieldbus.description import describe
     from drive_env.master.parameter_files import load_parameters
-    from drive_env.master.parameters import Difference, compare
+    from drive_env.master.parameters import compare
 
     with errors_as_exit_codes():
         if other is not None:
@@ -107,8 +107,8 @@ def diff(
             wanted, found = load_parameters(file, dictionary), load_parameters(other, dictionary)
             _tell_of_changes(file)
             _tell_of_changes(other)
-            differences = [
-                Difference(dictionary.find(key), wanted.get(key, 0), found.get(key))
+            differences: list[Any] = [
+                (dictionary.find(key), wanted.get(key), found.get(key))
                 for key in {**wanted, **found}
                 if wanted.get(key) != found.get(key)
             ]
@@ -224,8 +224,8 @@ def _exchange(
     from drive_env.fieldbus.description import describe
     from drive_env.master import parameters
 
-    axis, node = bus.one_axis, bus.number
-    wanted = parameters.restorable(wanted, describe(bus.device, eds).hints)
+    axis, node, source = bus.one_axis, bus.number, wanted
+    wanted = parameters.restorable(source, describe(bus.device, eds).hints)
     if dry_run:  # opening a stopped node would send it an NMT command
         bus.look_first(eds)
     with ExitStack() as written:
@@ -233,9 +233,14 @@ def _exchange(
             _check_axis(drives, axis)
             check(drives)
             differences = parameters.compare(drives, wanted, axis)
+            addresses = {key: value for key, value in source.items() if key not in wanted}
+            staying = [one for one in parameters.compare(drives, addresses, axis) if one.found is not None]
             scale = scales_of(drives)[axis]
             if not json:
-                _print(differences, "drive", name, scale, json)
+                _print([*differences, *staying], "drive", name, scale, json)
+            if staying:
+                told = parameters.list_differences(staying)
+                print(f"drive-env: note: {told}: addresses are not restored", file=sys.stderr)
             if dry_run:
                 parameters.check_at_rest(drives, wanted, axis)
                 _tell_plan(differences, scale, node, store=store, json=json)
@@ -308,5 +313,5 @@ def _row(difference: Any, scale: Scale) -> dict[str, Any]:
         "found": found,
         "wanted": wanted,
         "found text": "absent" if found is None else show(found, entry, scale),
-        "wanted text": show(wanted, entry, scale),
+        "wanted text": "absent" if wanted is None else show(wanted, entry, scale),
     }

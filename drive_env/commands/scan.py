@@ -80,7 +80,7 @@ def scan(
 
 
 def _scan_ethercat(interface: str | None, channel: str | None, json: bool) -> None:
-    from drive_env.devices import device_of
+    from drive_env.devices import devices_of
     from drive_env.master.ethercat.state_names import state_name
     from drive_env.master.ethercat_drives import open_frames
 
@@ -91,7 +91,7 @@ def _scan_ethercat(interface: str | None, channel: str | None, json: bool) -> No
         master.close()
     rows: list[dict[str, Any]] = []
     for position, (status, identity) in enumerate(found):
-        device = device_of(0, identity.vendor, identity.product)
+        device = _name(devices_of(0, identity.vendor, identity.product))
         state = state_name(status.state) + (f", error {status.code:04X}h" if status.has_error else "")
         rows.append({"position": position, "device": device, "state": state} | identity._asdict())
     lines = []
@@ -127,7 +127,7 @@ def _find(port: Any, first: int, last: int, timeout: float) -> set[tuple[int, st
 
 
 def _look(port: Any, node: int, state: str, answers: int, timeout: float) -> dict[str, Any]:
-    from drive_env.devices import device_of
+    from drive_env.devices import devices_of
     from drive_env.dictionary.aborts import ObjectAccessError
     from drive_env.fieldbus.errors import BusError, NoAnswerError
     from drive_env.master.can.sdo import TWICE, SdoClient
@@ -159,8 +159,13 @@ def _look(port: Any, node: int, state: str, answers: int, timeout: float) -> dic
         number = read(0x1018, sub)
         if number is not None:
             row[name] = int.from_bytes(number, "little")
-    row["device"] = device_of(row["device type"], row.get("vendor"), row.get("product"))
+    row["device"] = _name(devices_of(row["device type"], row.get("vendor"), row.get("product")))
     return row | ({"answers": 2} if sdo.answered_twice >= TWICE else {})
+
+
+def _name(devices: list[str]) -> str | None:
+    """Return the names of the devices that a node may be; None without one."""
+    return " or ".join(devices) or None
 
 
 def _print(found: list[dict[str, Any]], timeout: float) -> None:

@@ -318,8 +318,8 @@ def device_names() -> list[str]:
     return sorted(path.parent.name for path in FOLDER.glob("*/device.toml"))
 
 
-def device_of(kind: int, vendor: int | None, product: int | None) -> str | None:
-    """Return the name of the known device with a node's identity; None for an unknown one.
+def devices_of(kind: int, vendor: int | None, product: int | None) -> list[str]:
+    """Return the names of the known devices with a node's identity, several where it does not tell them apart.
 
     Args:
         kind: Its 1000h; a device and its variants, which are one product, are identified by it.
@@ -331,7 +331,7 @@ def device_of(kind: int, vendor: int | None, product: int | None) -> str | None:
         dictionary = find_device(name).new_dictionary()
         if (vendor, product) == tuple(dictionary.find((0x1018, sub)).default for sub in (1, 2)):
             found.append((dictionary.find(0x1000).default != kind, name))
-    return min(found)[1] if found else None
+    return [name for differs, name in sorted(found) if differs == min(found)[0]]
 
 
 @cache

@@ -74,7 +74,10 @@ UNITS = {
 _INCREMENTAL = {"inc": "angle", "pps": "speed", "pps^2": "acceleration"}
 _BY_RATIO = {"velocity unit": "rpm", "velocity unit/s": "rpm/s", "set-point unit": "rpm"}
 # Field of the scale that a current is relative to, and its fraction.
-_OF_CURRENT = {"1/32767 M-Ipeak": ("peak_current", 1.0 / 32767.0), "1/1000 of M-Inull": ("nominal_current", 1e-3)}
+_OF_CURRENT = {
+    "1/32767 M-Ipeak": ("peak_current", 1.0 / 32767.0),
+    **dict.fromkeys(("1/1000 of M-Inull", "1/1000 M-Inull"), ("nominal_current", 1e-3)),
+}
 SHOWN = {"angle": "rev", "speed": "rpm", "acceleration": "rev/s^2", "current": "A", "voltage": "V", "time": "s"}
 CHARACTERS = "chars"  # four of a text, the first one in the lowest byte
 _QUANTITY = re.compile(r"^\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(\S.*?)?\s*$")
@@ -206,7 +209,11 @@ def integers(text: str, entry: Entry, scale: Sequence[Scale], where: Mask | None
         ValueError: As `parse` does.
     """
     chosen = np.ones(len(scale), bool) if where is None else where
-    return np.array([parse(text, entry, one) if mine else 0 for one, mine in zip(scale, chosen, strict=True)], np.int64)
+    found = [parse(text, entry, one) if mine else 0 for one, mine in zip(scale, chosen, strict=True)]
+    try:
+        return np.array(found, np.int64)
+    except OverflowError:
+        raise ValueError(_too_large(text, entry)) from None
 
 
 def in_unit(raw: Integers, entry: Entry, unit: str, scale: Sequence[Scale]) -> Floats:

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from drive_env import cia402
 from drive_env.cia402 import Key
-from drive_env.devices import device_of, find_device
+from drive_env.devices import devices_of, find_device
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.access import check_readable, check_writable, checked_values
 from drive_env.dictionary.entries import Entry, ObjectName, ObjectNames, Rows
@@ -458,10 +458,9 @@ class BusDrives:
     def _who_it_is(self, kind: int, axis: int) -> str:
         """Return the advice for a message: as which device, or with which EDS, to open this node."""
         vendor, product = (self.read_axis(self._description.dictionary.find(key), axis) for key in list(_IDENTITY)[:2])
-        other = device_of(kind, vendor, product)
-        if other is None:
+        if not (others := devices_of(kind, vendor, product)):
             return "give its own EDS (eds=..., --eds)"
-        return f"it is a {other}: name it so (device={other!r}, --device {other})"
+        return f"it is a {' or '.join(others)}: name it so (device={others[0]!r}, --device {others[0]})"
 
     def _check_variant(self, node: int, kind: int) -> None:
         """Raise BusError for a node that is another variant of the device, which may count in other units."""
@@ -469,7 +468,7 @@ class BusDrives:
         if self.device is None or kind == known.find(_DEVICE_TYPE).default:
             return
         vendor, product = (int(known.find((0x1018, sub)).default) for sub in (1, 2))
-        other = device_of(kind, vendor, product)
+        other = next(iter(devices_of(kind, vendor, product)), None)
         if other is not None and find_device(other).new_dictionary().find(_DEVICE_TYPE).default == kind:
             raise BusError(
                 f"node {node} is a {other}, not a {name}: its device type (1000h:00) is {kind:08X}h; name it so "

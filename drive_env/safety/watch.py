@@ -390,7 +390,8 @@ class Watch:
             axis = int(np.flatnonzero(blind)[0])
             self._stops.stop_for(
                 f"axis {axis} could not be seen for {now - float(self._axes.seen[axis]):.2f} s",
-                "check the node's power and wiring, and the bus load",
+                "check the node's power and wiring, the bus load, whether another master has stopped it, and how busy "
+                "this computer is",
             )
         if self._missed >= MISSED:
             self._missed = 0

@@ -113,6 +113,10 @@ def test_each_axis_has_its_own_scale_and_the_others_none():
     assert integers("0.5 rev/s", entry("pps"), scale, where).tolist() == [500, 0, 1000]
     with pytest.raises(ValueError, match="has no unit"):
         integers("0.5 rev/s", entry("pps"), scale)
+    with pytest.raises(
+        ValueError, match=r"'1e30 rev/s' is beyond any number; .* takes -2147483648 to 2147483647 in pps"
+    ):
+        integers("1e30 rev/s", entry("pps"), [TURN])
 
 
 def test_integers_in_a_unit():
@@ -145,7 +149,7 @@ OF_ITS_OWN = AxisScale(TURN, 3 / 1000, 8.0, 2.0)
     ("30 rpm", "velocity unit", 10_000), ("0.5 rev/s", "velocity unit", 10_000), ("-3 rpm", "velocity unit", -1000),
     ("600 rpm/s", "velocity unit/s", 200_000), ("1 rev/s^2", "velocity unit/s", 20_000),
     ("8 A", "1/32767 M-Ipeak", 32_767), ("-2 A", "1/32767 M-Ipeak", -8192),
-    ("-1 A", "1/1000 of M-Inull", -500), ("17", "velocity unit", 17),
+    ("-1 A", "1/1000 of M-Inull", -500), ("3 A", "1/1000 M-Inull", 1500), ("17", "velocity unit", 17),
 ])  # fmt: skip
 def test_a_velocity_unit_and_a_part_of_the_peak_current_follow_their_own_scales(text, unit, raw):
     assert parse(text, entry(unit), OF_ITS_OWN) == raw

@@ -88,6 +88,20 @@ def test_a_file_of_this_drive_is_restored_and_proven_by_another_connection(drive
     assert second.sent(0x601) and not [data for data in second.sent(0x601) if data[0] & 0xE0 == 0x20]
 
 
+@pytest.mark.parametrize("arguments", [("--yes",), ("--dry-run",), ("--yes", "--json")])
+def test_what_is_never_restored_is_told_where_it_differs(drive, tmp_path, arguments):
+    drive.values[0x2705, 0] = (1, 4)
+    drive.set(PROFILE_VELOCITY, SPEED)
+    path = tmp_path / "drive.toml"
+    assert run("parameters", "backup", path)[0] == DONE
+    drive.set(0x2705, 6)
+    drive.buses.clear()
+    code, _, error = run("parameters", "restore", path, *arguments)
+    assert code == DONE, error
+    assert "drive-env: note: 2705h:00 Node ID is 6, not 1: addresses are not restored" in error
+    assert writes(drive) == [] and drive.get(0x2705) == 6
+
+
 def test_a_writer_is_not_believed(drive, file, monkeypatch):
     monkeypatch.setattr(parameters, "write_all_or_none", lambda drives, wanted, axis: [])
     code, out, error = run("parameters", "restore", file, "--yes")
@@ -135,6 +149,16 @@ def test_a_difference_is_shown_also_of_a_file_that_was_changed_and_it_is_said(dr
     code, out, error = run("parameters", "diff", file, "--json")
     assert [row["wanted"] for row in json.loads(out)] == [50]
     assert (code, error.startswith(f"drive-env: note: {file} was changed since it was written")) == (REFUSED, True)
+
+
+def test_a_parameter_that_one_of_two_files_lacks_is_absent_there(file, tmp_path):
+    lines = file.read_text(encoding="utf-8").splitlines(keepends=True)
+    less = tmp_path / "less.toml"
+    less.write_text("".join(line for line in lines if not line.startswith('"6081:00"')), encoding="utf-8")
+    for pair, texts in ((file, less), ("absent", f"{SPEED} pps")), ((less, file), (f"{SPEED} pps", "absent")):
+        code, out, _ = run("parameters", "diff", *pair, "--json")
+        assert code == REFUSED
+        assert [(row["found text"], row["wanted text"]) for row in json.loads(out)] == [texts]
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from rigs.held_objects import HeldObjects
 from rigs.scripted_drive import ScriptedBus, ScriptedDrive
 
 from drive_env import CanDrives
-from drive_env.devices import find_device
+from drive_env.devices import device_names, find_device
 from drive_env.dictionary.entries import Entry
 from drive_env.master.parameters import (
     COMMANDS,
@@ -182,6 +182,12 @@ def test_commands_of_further_axes_are_commands_and_what_makes_a_node_mute_is_nev
     check_no_commands([(0x6081, 0)], "f", hints)
     address = next(iter(hints.addresses))
     assert restorable({(address, 0): 1, (0x6081, 0): 2}, hints) == {(0x6081, 0): 2}
+
+
+def test_no_node_id_and_no_bit_rate_is_ever_written_back():
+    for device in map(find_device, device_names()):
+        objects = [device.canopen.objects.get(what) for what in ("node_id", "bit_rate")]
+        assert {key[0] for key in objects if key} <= set(device.master.addresses), device.name
 
 
 def test_what_commands_and_serves_by_cia_301_and_402():

@@ -25,6 +25,7 @@ from drive_env.bus.world import World
 from drive_env.commands import scan
 from drive_env.commands.cli import GROUPS, PANELS, app
 from drive_env.commands.monitor import spark_line
+from drive_env.devices import find_device
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.drives.limits import Limits
 from drive_env.fieldbus.errors import BusError, NoAnswerError
@@ -105,6 +106,22 @@ class SilentPort:
 
     def subscribe(self, can_id, handler):
         pass
+
+
+def test_scan_names_every_device_that_a_node_may_be(monkeypatch, capsys):
+    """A TGZ-S tells 1000h and 1018h of a TGZ-D."""
+    identity = {(0x1000, 0): 0xFFFF0192, (0x1018, 1): 0, (0x1018, 2): 0x54475A44, (0x1018, 3): 0x10000}
+    said = find_device("tgz_s").new_dictionary()
+    assert all(said.find(key).default == value for key, value in identity.items())
+
+    def read(client, index, sub, what, timeout):
+        if (index, sub) not in identity:
+            raise ObjectAccessError(0x06020000, "no")
+        return identity[index, sub].to_bytes(4, "little")
+
+    monkeypatch.setattr("drive_env.master.can.sdo.SdoClient.read", read)
+    scan._print([scan._look(SilentPort(), 3, "", 1, 0.3)], 0.3)
+    assert capsys.readouterr().out.startswith("node 3  tgz_d or tgz_d_2026 or tgz_s  vendor 0h")
 
 
 @pytest.mark.parametrize(

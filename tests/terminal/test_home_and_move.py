@@ -121,6 +121,17 @@ def test_a_move_ends_where_it_says_and_gives_the_speed_back(served, run):
     assert float(drives.machine.rotor_angle[0]) == pytest.approx(angle, abs=0.1)
 
 
+@pytest.mark.parametrize("words", [("move", "2147483647", "--relative"), ("jog", "60 rpm", "--by", "2147483647")])
+def test_a_relative_target_beyond_what_607a_holds_is_refused_before_the_axis_is_enabled(served, run, words):
+    drives = served[0]
+    assert run("move", "1000", "--speed", "60 rpm", "--yes").exit_code == DONE
+    here, word = int(drives.read(0x6064)[0]), int(drives.read(0x6040)[0])
+    found = run(*words, *(["--yes"] if words[0] == "move" else []))
+    assert found.exit_code == USER_ERROR, found.output
+    assert f"607Ah:00 Target position cannot be {2**31 - 1 + here}; its highest is 2147483647" in found.stderr
+    assert (int(drives.read(0x6064)[0]), int(drives.read(0x6040)[0])) == (here, word)
+
+
 @pytest.mark.slow
 def test_homing_finds_the_switch_s_edge_and_gives_the_method_back(served, run):
     drives = served[0]

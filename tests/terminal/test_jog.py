@@ -22,10 +22,15 @@ TURN = 65536
 
 
 @pytest.fixture
-def jog(monkeypatch):
-    """A command on a belt axis with limit switches; and the axis."""
+def drives():
+    """A belt axis with limit switches."""
+    return EmulatedDrives(load="belt", num_threads=1)
+
+
+@pytest.fixture
+def jog(monkeypatch, drives):
+    """A command on a drive; and the drive."""
     world = World(lockstep=False)
-    drives = EmulatedDrives(load="belt", num_threads=1)
     world.add(drives, [1])
     channel = str(uuid.uuid4())
     for name, value in {"INTERFACE": "virtual", "CHANNEL": channel, "TIMEOUT": "20"}.items():
@@ -33,6 +38,20 @@ def jog(monkeypatch):
     with Server(world, CanPort(can.Bus(interface="virtual", channel=channel))):
         yield lambda *words: CliRunner().invoke(drive_env.commands.cli.app, ["jog", *words]), drives
     world.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("drives", [EmulatedDrives("tgz_s", load="inertia", num_threads=1)])
+def test_amperes_of_a_drive_that_counts_in_its_motor_s_current_limit_it_and_are_recorded(jog, tmp_path):
+    run, drives = jog
+    peak = 1e-3 * drives.read(0x2107)[0]  # M-Ipeak [A]; 6077h counts 32767ths of it
+    words = ("1000 rpm", "--for", "0.3", "--max-current", "0.5 A", "--device", "tgz_s")
+    found = run(*words, "--out", str(tmp_path / "move"))
+    assert found.exit_code == 0, found.output
+    header, *rows = (tmp_path / "move.csv").read_text(encoding="utf-8").splitlines()
+    column = next(k for k, name in enumerate(header.split(",")) if name.startswith("6077h"))
+    most = max(abs(int(row.split(",")[column])) for row in rows) * peak / 32767
+    assert 0.4 < most < 0.55
 
 
 def is_off(drives):
@@ -68,6 +87,21 @@ def test_an_axis_that_does_not_move_is_told(jog):
     assert "the axis hardly moved, and the drive reports no cause. The speed was 327680 pps (300 rpm)" in found.stderr
     assert "Else check for a closed brake, a blocked load" in found.stderr
     assert "Limits(" not in found.output and is_off(drives)
+
+
+@pytest.mark.parametrize(
+    ("speed", "way", "words"),
+    [
+        ("100 rpm", "0 rev", "--by 0 rev is less than one increment: nothing would move"),
+        ("100 rpm", "0.000001 rev", "--by 0.000001 rev is less than one increment"),
+        ("-300 rpm", "2 rev", "-300 rpm turns the other way than --by 2 rev; leave out one sign"),
+    ],
+)
+def test_a_distance_that_moves_nothing_or_the_other_way_is_refused_before_the_axis_is_enabled(jog, speed, way, words):
+    run, drives = jog
+    found = run(speed, "--by", way)
+    assert found.exit_code == 2 and words in found.stderr, found.output
+    assert drives.read(0x6064)[0] == 0 and drives.read(0x6040)[0] == 0
 
 
 @pytest.mark.slow

@@ -217,6 +217,8 @@ def test_without_a_method_it_says_so_and_offers_those_of_the_drive(fresh, tmp_pa
     ({"current": "3 V"}, "limits", "is not a quantity in 'V'"),
     ({"quick-stop": "0"}, "limits", "6085h"),
     ({"lowest": "2 rev", "highest": "3 rev"}, "homing", "axis 0 stands at "),
+    ({"lowest": "3 rev", "highest": "-3 rev"}, "homing", "axis 0: the highest position -196608 is not above"),
+    ({"lowest": "3 rev", "highest": "3 rev"}, "homing", "axis 0: the highest position 196608 is not above"),
 ])  # fmt: skip
 def test_a_limit_that_cannot_be_fails_its_step_and_changes_nothing(fresh, tmp_path, limits, step, told):
     with CommissioningPath(fresh, CommissioningPlan(limits=limits), tmp_path / "x") as path:
@@ -272,6 +274,9 @@ def test_a_dry_run_reads_and_lists_the_steps_and_their_objects():
     (("--limit", "current"), "--limit current must be NAME=VALUE, with one of current, speed"),
     (("--limit", "jerk=3"), "--limit jerk=3 must be NAME=VALUE"),
     (("--limit", "current=3 V"), "is not a quantity in 'V'"),
+    (("--limit", "lowest=-3 rev", "--skip", "homing"), "--limit lowest is written by the step homing, which is"),
+    (("--limit", "current=3 A", "--step", "homing"), "--limit current is written by the step limits, which is"),
+    (("--method", "35", "--skip", "homing"), "--method is written by the step homing, which is left out"),
     (("--dynamics", "brisk"), "give soft, standard, stiff"),
 ])  # fmt: skip
 def test_a_mistake_is_named_before_anything_is_done(words, told):

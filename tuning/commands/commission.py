@@ -28,6 +28,7 @@ from tuning.commands.options import (
 )
 
 if TYPE_CHECKING:
+    from tuning.commissioning.bench import CommissioningPlan
     from tuning.commissioning.path import CommissioningPath, StepState
     from tuning.commissioning.steps import CommissioningStep
     from tuning.target import Target
@@ -98,6 +99,7 @@ def commission(
         chosen = _chosen(step, skip)
         asked = asked_dynamics(dynamics, drive.device, inertia_range)
         plan = CommissioningPlan(asked, method, _limits(limit), store, drive.seed)
+        _check_used(plan, chosen)
         folder = provenance.run_folder("commission") if out is None else out
         provenance.check_folder(folder)
         if dry_run:
@@ -137,6 +139,18 @@ def _chosen(step: Sequence[str] | None, skip: Sequence[str] | None) -> set[str]:
         if unknown := next((name for name in names or () if name not in STEPS), None):
             raise ValueError(f"{option} {unknown}: the steps are {', '.join(STEPS)}")
     return set(step or STEPS) - set(skip or ())
+
+
+def _check_used(plan: CommissioningPlan, chosen: set[str]) -> None:
+    """Raise ValueError for a limit or a homing method whose step is left out: it would not be written."""
+    from tuning.commissioning.axis_limits import LIMITS
+
+    written = {f"--limit {name}": "homing" if LIMITS[name].is_place else "limits" for name in plan.limits}
+    written |= {} if plan.method is None else {"--method": "homing"}
+    if unused := next((option for option, step in written.items() if step not in chosen), None):
+        raise ValueError(
+            f"{unused} is written by the step {written[unused]}, which is left out; do that step, or leave out {unused}"
+        )
 
 
 def _limits(given: Sequence[str] | None) -> dict[str, str]:

@@ -45,8 +45,8 @@ def identify(
     """Identify axes: winding, encoder, inertia, friction, gravity, resonance, delay and filter.
 
     The motor turns: there and back within --travel, up to its rated current and 0.7 of its rated speed. Every value has
-        a 95 % interval; a value that cannot be identified has the reason instead. Afterwards the drive is off and has
-        its own parameters; on a bus they are also saved to a file for `drive-tune undo`, beside --out or in runs/.
+    a 95 % interval; a value that cannot be identified has the reason instead. Afterwards the drive is off and has
+    its own parameters; on a bus they are also saved to a file for `drive-tune undo`, beside --out or in runs/.
     """
     with errors_as_exit_codes():
         if out is not None and not out.parent.is_dir():

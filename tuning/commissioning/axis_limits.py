@@ -117,12 +117,17 @@ def check_limits_of_motor(target: Target) -> list[str]:
 
 
 def check_place_of_axes(target: Target) -> None:
-    """Raise ValueError if an axis is outside the drive's position limits."""
+    """Raise ValueError if an axis is outside the drive's position limits, or the upper one not above the lower."""
     low, high = (cia402.POSITION_LIMITS, 1), (cia402.POSITION_LIMITS, 2)
     if not target.device.new_dictionary().has(low):
         return
     least, most, here = (target.drives.read(key) for key in (low, high, cia402.POSITION_ACTUAL))
     for axis, a, b, x in zip(target.axis_numbers, least.tolist(), most.tolist(), here.tolist(), strict=True):
+        if a >= b and (a, b) != (0, 0):  # 0 and 0: no limits
+            raise ValueError(
+                f"axis {axis}: the highest position {b} is not above the lowest {a} (607Dh): give `lowest` and "
+                "`highest` from home"
+            )
         if a < b and not a <= x <= b:
             raise ValueError(
                 f"axis {axis} stands at {x}, outside of {a} to {b} (607Dh): give `lowest` and `highest` from home, so "
