@@ -142,12 +142,12 @@ def check_seal(path: Path, table: Mapping[str, Any], *, unchecked: bool = False)
     if stated is None:
         raise FileChangedError(
             f"{path} has no check sum: it was written by hand, or by an older version, so that neither its "
-            "completeness nor its drive can be checked. Read through it, then add --unchecked"
+            "completeness nor its drive can be checked. Read through it, then restore it with --unchecked"
         )
     if content_hash({name: value for name, value in table.items() if name != _CHECK}) != stated:
         raise FileChangedError(
             f"{path} was changed since it was written: its content does not match its check sum. If you changed it, "
-            "read through it, then add --unchecked; otherwise take another copy"
+            "read through it, then restore it with --unchecked; otherwise take another copy"
         )
 
 

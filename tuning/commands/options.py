@@ -281,7 +281,10 @@ def parse_travel(text: str) -> tuple[float, float]:
     except ValueError:
         raise ValueError(f"--travel {text} must be LOW:HIGH in turns, e.g. -0.15:0.15, or free") from None
     if not ends[0] <= 0.0 <= ends[1] or not ends[0] < ends[1]:
-        raise ValueError(f"--travel {text} must contain 0, where the rotor is now; give the free way to both sides")
+        raise ValueError(
+            f"--travel {text} must contain 0, where the rotor is now, and must not be empty; give the free way to both "
+            "sides"
+        )
     return ends
 
 
