@@ -35,7 +35,7 @@ CONSTRAINED_PACKING_BOUND = 1e-9
 _MEMORY_PER_COPY = 2048  # bytes; 64 two-mass copies were measured at 194 each
 _MEMORY_PER_CONSTRAINED_COPY = 400_000
 _MEMORY_FIXED = 65536
-_MOST_KEPT = 8  # foreign models kept as compiled, each alone
+_MOST_KEPT = 32  # models kept as compiled, each alone
 JOINT_TRANSMISSIONS = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 _REMEDIES = {  # remedies for MuJoCo's messages
     "mjMINVAL": "give it an <inertial>, or geoms with a mass",
@@ -60,11 +60,12 @@ def read_any_model(load: Load) -> mujoco.MjModel:
         ValueError: If there is no such file, it includes files from elsewhere, it exceeds a limit, or MuJoCo cannot
             read it.
     """
-    if _is_ours(load.mjcf):
-        return _compiled(load, _spec(load))
-    key = load.name, _hash_of(load.mjcf)
+    ours = _is_ours(load.mjcf)
+    key = load.name, _text_of(load.mjcf) if ours else _hash_of(load.mjcf)
     kept = _kept.pop(key, None)
-    _kept[key] = kept = _compiled_elsewhere(load, None) if kept is None else kept
+    if kept is None:
+        kept = _compiled(load, _spec(load)) if ours else _compiled_elsewhere(load, None)
+    _kept[key] = kept
     while len(_kept) > _MOST_KEPT:
         _kept.popitem(last=False)
     return copy.copy(kept)  # the caller may change it
@@ -403,6 +404,10 @@ _harmless: set[tuple[str, str]] = set()
 
 def _is_ours(mjcf: Path) -> bool:
     return mjcf.parent == MODELS
+
+
+def _text_of(mjcf: Path) -> str:
+    return mjcf.read_text(encoding="utf-8") if mjcf.is_file() else ""
 
 
 def _hash_of(mjcf: Path) -> str:

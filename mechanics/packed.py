@@ -440,6 +440,13 @@ def _copies_last(array: Floats) -> Floats:
     return array.transpose(*range(1, array.ndim), 0)
 
 
+def default_values(load: Load) -> dict[str, float]:
+    """Return the value of each of a load's parameters as its row and its model have it; ValueError as `PackedLoad`."""
+    one, axes = template_of(load, 1), (1, load.num_axes)
+    values = LoadValues(load, one.model, one.joints, one.bodies, np.ones(axes), np.zeros((*axes, 4)))
+    return {parameter.name: float(values.get(parameter.name)[0]) for parameter in load.parameters}
+
+
 def pack(
     load: Load,
     armature: Floats,

@@ -47,7 +47,7 @@ from drive_env.saved_state import Saved, State, check_alike
 from mechanics.arrays import Floats, Integers, Mask
 from mechanics.load import Load
 from mechanics.loads import find_load
-from mechanics.packed import PackedLoad
+from mechanics.packed import default_values
 
 MOST_PREPARED = 64  # prepared calls of record that are kept: more than any loop alternates between
 
@@ -340,13 +340,10 @@ class EmulatedDrives(Saved):
         wired_as_known: bool,
     ) -> tuple[dict[str, MachineParameter], dict[str, Floats], Floats]:
         """Return the rows of the machines' parameters, their values, and the seed of each axis' noise."""
-        axes = (1, self.load.num_axes)
-        single = PackedLoad(self.load, np.ones(axes), np.zeros((*axes, 4)), {}, 1e-6)
-        defaults = {p.name: float(single.get(p.name)[0]) for p in self.load.parameters}
         kind = MACHINE_KINDS[self.device.firmware_name]
-        table = parameter_table(kind, self.device, self.motor, self.load, defaults)
+        table = parameter_table(kind, self.device, self.motor, self.load, default_values(self.load))
         values, noise = draw_parameters(table, seed, numbers, randomise, ideal, wired_as_known=wired_as_known)
-        seeds = np.repeat(noise, self.load.num_axes) + np.tile(np.arange(axes[1]), self.num_machines)
+        seeds = np.repeat(noise, self.load.num_axes) + np.tile(np.arange(self.load.num_axes), self.num_machines)
         for name, value in given.items():
             check_known(name, table)
             values[name] = np.broadcast_to(np.asarray(value, float), (self.num_machines,)).copy()

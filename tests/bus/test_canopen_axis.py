@@ -66,6 +66,7 @@ def test_every_bound_object_reads_alike_whatever_is_in_the_record(shared, data):
             shared.inside.records[field.name] = before
 
 
+@pytest.mark.every(7)
 @pytest.mark.parametrize(
     "entry",
     [e for e in ENTRIES if e.access == "rw" and e.bits and (e.index, e.sub) not in DEVICE.unsupported],

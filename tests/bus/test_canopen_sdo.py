@@ -169,6 +169,7 @@ REFUSED = [
 ]
 
 
+@pytest.mark.every(7)
 @pytest.mark.parametrize(("request_", "code"), REFUSED)
 def test_a_refused_access_names_the_object_and_changes_nothing(wire, request_, code):
     abort = bytes.fromhex(code)[::-1].hex(" ").upper()

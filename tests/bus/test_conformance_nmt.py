@@ -65,6 +65,7 @@ def without_register(frame):
 
 
 # --- states -----------------------------------------------------------------------------------------------------------
+@pytest.mark.every(5)
 @EACH_DEVICE
 @pytest.mark.parametrize("start", TO)
 def test_commands_move_the_state(wire, facts, start):
@@ -127,6 +128,7 @@ def test_stopped_takes_the_enabled_axis_to_fault_and_no_other(wire, facts, axis)
     assert read(wire, facts, 0x1001) == 0
 
 
+@pytest.mark.every(5)
 @EACH_AXIS
 def test_a_turning_axis_brakes_when_its_node_is_stopped(wire, facts, axis):
     enable(wire, facts, [axis])
@@ -142,6 +144,7 @@ def test_a_turning_axis_brakes_when_its_node_is_stopped(wire, facts, axis):
     assert abs(read(wire, facts, VELOCITY + PROFILE * axis)) < 0.1 * speed
 
 
+@pytest.mark.every(7)
 @EACH_AXIS
 @pytest.mark.parametrize("words", [[], [6], [6, 7]])
 def test_other_states_of_an_axis_do_not_care_about_stopped(wire, facts, axis, words):

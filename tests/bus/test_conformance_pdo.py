@@ -103,6 +103,7 @@ def test_the_pdos_of_an_axis_map_its_own_objects(facts):
 
 
 # --- received ---------------------------------------------------------------------------------------------------------
+@pytest.mark.every(9)
 @EACH_RPDO
 def test_what_is_received_reaches_the_mapped_objects_alone(wire, facts, pdo):
     entries = facts.mapped(pdo)
@@ -125,6 +126,7 @@ def test_what_is_received_reaches_the_mapped_objects_alone(wire, facts, pdo):
     assert states(wire, facts) == others(facts, axis, READY if word else SWITCH_ON_DISABLED, SWITCH_ON_DISABLED)
 
 
+@pytest.mark.every(19)
 @EACH_RPDO
 @pytest.mark.parametrize(("bytes_", "code"), [(-8, "10 82"), (-1, "10 82"), (1, "20 82")])
 def test_another_length_is_told_once_and_not_processed(wire, facts, pdo, bytes_, code):
@@ -204,6 +206,7 @@ def test_what_is_sent_is_what_an_sdo_reads(wire, facts, pdo):
     assert parts(frame.data, entries) == [read(wire, facts, *entry.key) for entry in entries]
 
 
+@pytest.mark.every(9)
 @EACH_TPDO
 def test_every_transmission_type(wire, facts, pdo):
     """0: at a SYNC after a change; n: at every nth; 254 and 255: once, at the change."""

@@ -228,6 +228,7 @@ def test_a_number_comes_in_segments(wire, facts, axis, size):
     """)
 
 
+@pytest.mark.every(7)
 @EACH_AXIS
 @pytest.mark.parametrize(
     ("segment", "code"),

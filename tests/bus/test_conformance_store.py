@@ -71,6 +71,7 @@ def test_1010h_has_a_group_for_each_sub_index(facts):
     assert facts.default(STORE) == facts.default(RESTORE) == len(facts.manual.groups)
 
 
+@pytest.mark.every(4)
 @EACH_GROUP
 def test_a_group_stores_its_areas_and_no_other(wire, facts, sub):
     before = {entry.key: read(wire, facts, *entry.key) for entry in facts.parameters()}
@@ -84,6 +85,7 @@ def test_a_group_stores_its_areas_and_no_other(wire, facts, sub):
     assert wire.value(STORE, sub) == wire.value(RESTORE, sub) == 1
 
 
+@pytest.mark.every(4)
 @EACH_GROUP
 def test_a_group_is_restored_alone_and_after_a_reset_only(wire, facts, sub):
     changed = samples(wire, facts)

@@ -442,6 +442,7 @@ def test_configuring_a_running_axis_changes_nothing(drives):
     assert abs(drives.machine.rotor_speed[0]) > 1.0
 
 
+@pytest.mark.every(5)
 @pytest.mark.parametrize("node_id", [9, 255])
 @pytest.mark.parametrize("reset", ["82 05", "82 00", "81 05"])
 def test_a_new_node_id_stops_the_axis_as_it_takes_effect(drives, node_id, reset):
@@ -479,6 +480,7 @@ def test_whatever_lss_does_the_nodes_old_master_cannot_move_it_afterwards(drives
 
 
 # --- whatever comes ---------------------------------------------------------------------------------------------------
+@pytest.mark.every(5)
 @pytest.mark.parametrize("seed", range(6))
 def test_any_requests_leave_a_slave_that_answers(drives, seed):
     drives.machine.reset()

@@ -162,6 +162,7 @@ def test_any_interface_serves(tmp_path):
     assert "on virtual test" in done.stdout
 
 
+@pytest.mark.every(7)
 @pytest.mark.parametrize(("arguments", "message"), [
     (["tmcm1637"], "drive-env: no device is named 'tmcm1637'; there are tgz_d, tgz_d_2026"),
     (["--load", "abc"], "drive-env: no load is named 'abc'; there are "),

@@ -269,7 +269,7 @@ def check_full_bus(duration):
 
 
 def test_a_full_bus_loses_nothing_that_it_can_carry():
-    check_full_bus(3.0)
+    check_full_bus(1.0)
 
 
 class Writer(Client):

@@ -58,6 +58,7 @@ def refusal(drives, name, value, **how):
 
 
 # --- what is refused --------------------------------------------------------------------------------------------------
+@pytest.mark.every(7)
 @pytest.mark.parametrize(
     ("name", "value", "code", "words"),
     [
@@ -204,6 +205,7 @@ def fresh():
         yield made
 
 
+@pytest.mark.every(7)
 @pytest.mark.parametrize("entry", PLAYABLE, ids=lambda e: f"{e.index:04X}:{e.sub}")
 def test_every_bound_object_plays_for_all_axes_alike_and_for_each(fresh, entry):
     drives = fresh
@@ -310,6 +312,7 @@ def test_the_contract_below_covers_the_dictionary():
     )
 
 
+@pytest.mark.every(7)
 @pytest.mark.parametrize("entry", WRITABLE, ids=lambda e: f"{e.index:04X}:{e.sub}")
 def test_every_writable_object_takes_its_range_and_reads_back(drives, entry):
     key = entry.index, entry.sub
@@ -372,6 +375,7 @@ RANGES = {"1/65536 turn": (-(2**15), 2**15 - 1), "counter": (-(2**31), 2**31 - 1
           "position limit": (-(2**31), 2**31 - 1)}  # fmt: skip
 
 
+@pytest.mark.every(7)
 @pytest.mark.parametrize("unit", sorted(units.UNITS))
 @settings(max_examples=15, deadline=None, derandomize=True)
 @given(data=st.data())
@@ -384,6 +388,7 @@ def test_every_unit_makes_the_round_trip(unit, data):
     assert (codec.encode(row, codec.decode(row, raw, factor), factor) == raw).all()
 
 
+@pytest.mark.every(5)
 @pytest.mark.parametrize("unit", sorted(name for name, row in units.UNITS.items() if not row.period))
 @settings(max_examples=10, deadline=None, derandomize=True)
 @given(value=st.floats(-1e12, 1e12))
@@ -401,7 +406,7 @@ def test_what_is_encoded_is_rounded_and_saturates(unit, value):
         assert raw == -1000
 
 
-@pytest.mark.every(4)
+@pytest.mark.every(12)
 @pytest.mark.parametrize("unit", sorted(units.UNITS))
 @settings(max_examples=30, deadline=None, derandomize=True)
 @given(data=st.data())

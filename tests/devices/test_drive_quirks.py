@@ -207,6 +207,7 @@ def test_without_a_buffer_each_set_point_replaces_the_one_before(tmp_path):
         assert one(drives, 0x6062) == TURN
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("how", ["disable", "quick stop", "mode", "reset"])
 def test_a_set_point_that_waits_is_forgotten_with_the_move(tmp_path, how):
     with build(tmp_path, set_point_buffer=1) as drives:

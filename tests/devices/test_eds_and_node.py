@@ -49,6 +49,7 @@ def numbers(variables):
     return [one for one in variables.values() if one.data_type in datatypes.INTEGER_TYPES and len(one) <= 32]
 
 
+@pytest.mark.every(3)
 def test_both_limits_of_an_object_are_taken(name, wire, variables):
     """Not in each state, and not each number between them: `[values]` of the device's data has the steps."""
     without = find_device(name).unsupported

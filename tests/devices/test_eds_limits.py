@@ -86,6 +86,7 @@ def test_every_object_that_can_be_written_is_in_one_of_the_tables():
     assert len(LIMITED) > 80
 
 
+@pytest.mark.every(5)
 @pytest.mark.parametrize("key", LIMITED, ids=lambda key: f"{key[0]:04X}:{key[1]}")
 def test_a_node_takes_both_ends_of_the_range_and_nothing_beyond(drives, key):
     low, high = LIMITED[key].min, LIMITED[key].max
@@ -98,6 +99,7 @@ def test_a_node_takes_both_ends_of_the_range_and_nothing_beyond(drives, key):
                 assert wire.value(*key) == raw
 
 
+@pytest.mark.every(7)
 @pytest.mark.parametrize(
     ("key", "rule"),
     [(key, rule) for rule in RULES for key in rule.keys],

@@ -185,6 +185,7 @@ def rows(dictionary):
     return found
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
 def test_a_clean_file_is_what_python_canopen_reads_by_itself(path):
     assert rows(read_eds(path, 5)) == rows(canopen.import_od(str(path), 5))

@@ -54,6 +54,7 @@ def turn(drive, path, **options):
     return drive
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize(
     "data",
     [

@@ -67,7 +67,7 @@ def mastered(path, device, **options):
 
 
 # --- limits within which an object cannot say "no limit" --------------------------------------------------------------
-@pytest.mark.every(2)
+@pytest.mark.every(6)
 @pytest.mark.parametrize(
     ("name", "key", "raw", "why"),
     [
@@ -174,6 +174,7 @@ def cob_ids(drives, directions=(0x1400, 0x1800)):
     return [int(drives.read((first + k, sub))[0]) for first in directions for k in (0, 1) for sub in (1, 2)]
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("safety", [Limits(), Limits(silence=None)], ids=["watched", "silence=None"])
 def test_pdos_that_can_only_be_read_are_taken_as_they_stand(made, safety):
     """RPDOs with 6040h, with 607Ah, with 60FFh; TPDOs with 6041h and 6064h, with 606Ch and 6077h."""

@@ -145,7 +145,7 @@ def facts_of(device):
     return turn, counts, modes
 
 
-@pytest.mark.every(3)
+@pytest.mark.every(9)
 @pytest.mark.parametrize("name", some(FIRST))
 def test_each_becomes_a_drive_that_lives(folders, name):
     folder = str(folders[name].folder)
@@ -184,7 +184,7 @@ def test_our_master_moves_it_by_the_vendors_eds(folders, name):
             assert np.all(np.abs(drives.read(0x6064) - turn // 2) < turn / 50)
 
 
-@pytest.mark.every(3)
+@pytest.mark.every(6)
 @pytest.mark.parametrize("name", some(ON_THE_BUS))
 def test_what_is_stored_stays_and_a_dcf_makes_the_same_drive(folders, tmp_path, name):
     folder = folders[name].folder
@@ -295,6 +295,7 @@ def drive_by_sdo(node, turn, counts, modes):
 
 
 # --- what is taken from the file --------------------------------------------------------------------------------------
+@pytest.mark.every(5)
 @pytest.mark.parametrize(
     ("name", "units", "scale"),
     [
@@ -372,6 +373,7 @@ def test_methods_of_the_standard_home_it_at_real_switches(folders, method, home)
         assert carriage == pytest.approx(home, abs=1e-3)
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("method", [33, 34, 35, 37])
 @pytest.mark.parametrize("offset", [1000, -250])
 def test_zero_is_at_home_plus_607ch_in_methods_without_a_switch_too(folders, method, offset):
@@ -495,6 +497,7 @@ def test_a_drive_without_1005h_is_served_and_takes_sync_as_080h(tmp_path):
         assert np.all(np.abs(drives.read(0x6064) - here - 1000) < 100)
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize(
     ("position", "velocity", "acceleration", "feed", "scale", "units"),
     [
@@ -561,6 +564,7 @@ def test_every_object_is_read_before_commissioning(tmp_path):
                 drives.read((entry.index, entry.sub))
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("factory", [(4096, 0), (0, 1), (0, 0), (0, 5), (4294967295, 0)])
 @pytest.mark.filterwarnings("error")
 def test_a_resolution_with_a_0_is_that_of_the_motor_s_encoder(tmp_path, factory):
@@ -765,6 +769,7 @@ def with_sub_objects(tmp_path, index, sections):
     return path, text[: text.index(before)].count("\n") + 1
 
 
+@pytest.mark.every(4)
 @pytest.mark.parametrize("index", WORDS)
 @pytest.mark.parametrize(("kind", "of_its_own"), [("0x7", True), ("0x9", True), ("0x7", False)])
 def test_sub_objects_of_a_word_do_not_matter_where_sub_index_0_is_the_word(tmp_path, index, kind, of_its_own):

@@ -86,6 +86,7 @@ def test_currents_are_counted_as_its_measuring_range_has_them(tmp_path):
     assert own["Torque Mode Settings.Torque_P"] == pytest.approx(known["Torque Mode Settings.Torque_P"] / 2, abs=1)
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("base", ["tmcm6212", "tmcm3313"])
 def test_a_stepper_stage_of_ones_own_makes_the_current_that_it_has(tmp_path, base):
     """One of 5.5 A, whose bridges detect a short at 12 A: a motor of 2.8 A rms gets its rated amplitude of 4 A."""

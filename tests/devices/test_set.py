@@ -46,6 +46,7 @@ def requests(drive):
     ]
 
 
+@pytest.mark.every(7)
 @pytest.mark.parametrize("status", [OFF, ENABLED])
 @pytest.mark.parametrize(
     "word", ["15", "0x0F", "0x1F", "0x10F", "0x8F", "79"], ids=["on", "hex", "start", "halt", "with reset", "relative"]
@@ -82,6 +83,7 @@ def test_a_controlword_that_stops_goes_through_without_a_question_and_first(driv
     assert not {"r6041", "r2058"} & set(asked[: asked.index("w6040")])
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("word", [0, 6])
 def test_what_takes_the_voltage_from_a_motor_that_turns_brings_it_to_rest_first(drive, word):
     """It brakes by 1,000 increments every 50 ms or so; its voltage stays until it stands."""
@@ -130,6 +132,7 @@ def test_any_other_write_to_a_live_axis_asks_first_and_says_why(drive, name, val
     assert drive.get(*key) == value
 
 
+@pytest.mark.every(7)
 @pytest.mark.parametrize("status", [ENABLED, QUICK_STOP, FAULT_REACTION])
 @pytest.mark.parametrize("name", ["1016:1", "100C", "100D", "1029:1"])
 @pytest.mark.parametrize("options", [(), ("--yes",), ("--raw", "--yes"), ("--dry-run",)], ids=str)

@@ -190,6 +190,7 @@ CHANGES = {  # what changes at 0.4 s: target, and numbers of the ramp
 }
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("sign", [1, -1])
 def test_what_changes_in_flight_breaks_no_ramp_and_ends_at_its_target(sign):
     """No speed changes faster than its ramp, jumps of start and end apart; no time passes at rest on the way."""

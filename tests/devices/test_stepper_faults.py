@@ -147,7 +147,7 @@ EACH_SESSION = pytest.mark.parametrize(
 )
 
 
-@pytest.mark.every(4)
+@pytest.mark.every(12)
 @EACH_SESSION
 def test_without_a_fault_a_session_moves_and_ends_at_rest(emulated, device, session):
     drives = emulated(device)
@@ -161,7 +161,7 @@ def test_without_a_fault_a_session_moves_and_ends_at_rest(emulated, device, sess
     assert device == "tmcm6212" or (drives.read(Role.LOOP_INITIALISED) == (session in CLOSED)).all()
 
 
-@pytest.mark.every(30)
+@pytest.mark.every(60)
 @pytest.mark.parametrize("count", [1, pytest.param(12, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", KINDS)
 @EACH_SESSION

@@ -142,7 +142,7 @@ def csp(drives):
     yield watch(drives, 0.03)
 
 
-@pytest.mark.every(2)
+@pytest.mark.every(6)
 @pytest.mark.parametrize("safety", [True, False])
 @pytest.mark.parametrize("script", [pp, pv, csp])
 def test_the_same_script_gives_the_same_integers_over_the_bus(inside, script, safety):
@@ -228,6 +228,7 @@ def ended(inside, session, limits=LIMITS):
     return error
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("gate", GATES)
 def test_the_program_is_told_that_an_axis_takes_no_commands_any_more(inside, gate):
     def session(drives):
@@ -358,6 +359,7 @@ def sdo(index, value, size, sub=0):
     return Frame(0x601, data.ljust(8, b"\0"))
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize(("index", "value", "size"), [(D_MODE, WRONG, 4), (cia402.MODE, 1, 1), (0x2403, 1, 4)])
 def test_frames_of_another_master_stop_the_axes_and_the_program_is_told(inside, index, value, size):
     inside.machine.reset()
@@ -444,7 +446,7 @@ def test_a_program_that_dies_in_real_time_leaves_no_axis_running(inside, gate):
 def test_python_canopen_moves_it_in_pp_and_is_ignored_with_another_d_mode(inside):
     with served(inside) as (world, channel):
         network = canopen.Network()
-        network.connect(interface="slcan", channel=channel)
+        network.connect(interface="slcan", channel=channel, sleep_after_open=0)
         try:
             node = canopen.RemoteNode(1, str(find_device("tgz_d").eds))
             network.add_node(node)

@@ -101,7 +101,7 @@ def assert_homed(drives, method, edge, way):
     assert drives.emergencies() == []
 
 
-@pytest.mark.every(2)
+@pytest.mark.every(6)
 @pytest.mark.parametrize(("method", "edge", "way"), METHODS, ids=[str(row[0]) for row in METHODS])
 def test_a_method_ends_where_the_manual_says_from_everywhere(belt, method, edge, way):
     bring(belt, STARTS)

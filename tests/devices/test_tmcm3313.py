@@ -249,7 +249,7 @@ METHODS = {1: ("left", 1), 2: ("right", -1), 3: ("home left", -1), 5: ("home rig
            18: ("right", 0), 19: ("home left", 0), 21: ("home right", 0), 33: ("", -1), 34: ("", 1)}  # fmt: skip
 
 
-@pytest.mark.every(2)
+@pytest.mark.every(6)
 @pytest.mark.parametrize("method", METHODS)
 def test_homing_methods_end_where_table_286_says(method):
     edge, way = METHODS[method]

@@ -95,6 +95,7 @@ def test_an_object_has_an_effect_on_its_axis_and_on_no_other(name):
     acts_on_one_axis(name, 0)
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("axis", [1, 2])
 @pytest.mark.parametrize("name", [0x2003, 0x2014, 0x2027, 0x6085], ids=label)
 def test_so_it_is_on_the_other_axes(name, axis):

@@ -55,6 +55,7 @@ def test_its_load_detection_is_that_of_the_tmcm6212_row_by_row():
         assert (entry.low, entry.high) == (row.lowest, row.highest)
 
 
+@pytest.mark.slow
 def test_a_sweep_of_two_currents_has_a_point_for_each_pair(tmp_path):
     shown = call("sweep", "--device", "tmcm3313", "--load", "inertia", "--show-config").output
     grid = shown[shown.index("[[sweep]]") : shown.index("[excitation]")]
@@ -370,7 +371,7 @@ VARIED = {"p": (4000, 30_000), "i": (1, 8000), "d": (1, 100_000), "limit": (2000
           "divider": (200, 2)}  # fmt: skip
 
 
-@pytest.mark.every(2)
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("prefix", "without"),
     [
@@ -449,6 +450,7 @@ def test_optimise_finds_gains_of_the_pid_and_leaves_the_loop_as_it_was():
         assert np.array_equal(*others) and not target.drives.read(Role.LOOP_MODE).any()
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize(("prefix", "slow"), [("pid", 1.1), ("pid_v0", 1.3)])
 def test_gain_tuning_and_its_robust_cost_tell_gains_of_the_pid_apart(prefix, slow):
     env = GainTuning(device="tmcm3313", motor=NAME, load="inertia", trials=2, num_threads=1,

@@ -120,7 +120,7 @@ LOADS = {pp: "robot", six_point: "inertia", pv: "robot", csp: "robot", csv: "rob
 SCRIPTS = {script.__name__: script for script in LOADS}
 
 
-@pytest.mark.every(4)
+@pytest.mark.every(8)
 @pytest.mark.parametrize(
     ("name", "safety"),
     [
@@ -150,6 +150,7 @@ def test_the_same_script_gives_the_same_integers(name, safety):
         assert (expected[3] & 0x6F == np.where(EACH == 3, 0x40, 0x27)).all()
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize(
     ("name", "value"),
     [

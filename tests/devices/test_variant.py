@@ -392,6 +392,7 @@ def test_its_sync_is_obeyed(drives):
     assert 0x185 in [frame.can_id for frame in wire.take()]
 
 
+@pytest.mark.every(7)
 @pytest.mark.parametrize(
     "key",
     sorted(key for key in KEYS - BY_RULE if ENTRIES[key].access == "rw"),

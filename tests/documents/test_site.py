@@ -33,6 +33,7 @@ finally:
     sys.path.remove(str(MACHINERY))
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("name", device_names())
 def test_a_device_has_a_page_with_all_its_objects_gains_roles_and_emergencies(name):
     device = find_device(name)

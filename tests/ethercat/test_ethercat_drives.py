@@ -260,6 +260,7 @@ def test_a_cable_that_is_pulled_stops_the_axes_by_the_slaves_own_watchdog(caplog
     assert not cia402.is_live(segment.drives.read(0x6041)).any()
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize(("register", "value"), [(0x0420, b"\0\0"), (0x0400, b"\xff\xff")])
 def test_a_watchdog_that_another_master_switches_off_stops_the_axes_and_is_set_again(register, value):
     """With 0420h = 0 the motors ran on for ever after the program's death; with 0400h = FFFFh for 26 times as long."""

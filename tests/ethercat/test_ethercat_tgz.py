@@ -343,6 +343,7 @@ def test_beside_the_native_image_each_d_mode_obeys_its_own_set_point(rig, machin
     assert machine.read(0x6041)[0] & 0x6F != 0x27
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("lockstep", [True, False])
 def test_what_the_native_image_had_moves_no_axis_that_is_enabled_nor_keeps_one_from_its_move(lockstep):
     """Its set-point is csp's alone: an axis enabled in csp went 0.1 turns to it, and moves in pp ended there."""

@@ -13,6 +13,7 @@ from drive_env.cia402 import State
 PACKAGES = ("drive_env", "mechanics", "tuning", "agents", "research")
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize(
     ("bits", "state"),  # bits 6 5 3 2 1 0 of 6041h (IEC 61800-7-201, state coding); x is either
     [

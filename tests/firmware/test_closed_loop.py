@@ -394,7 +394,7 @@ def test_a_deviation_beyond_its_window_stops_the_axis_in_a_loop_too():
         assert abs(lane(drives, "omega_m")[0]) < 0.1
 
 
-@pytest.mark.every(2)
+@pytest.mark.every(6)
 @pytest.mark.parametrize("mode", [1, 2, 3])
 @pytest.mark.parametrize("failure", ["encoder_broken", "encoder_stuck", "encoder_reversed"])
 def test_an_encoder_that_fails_in_a_loop_does_not_let_the_motor_run_away(mode, failure):

@@ -56,7 +56,7 @@ def mode_and_target_played(drives, turns):
     drives.record([0x6064], 0.5, play={0x6060: np.full(500, CSP), 0x607A: np.full(500, round(turns * TURN))})
 
 
-@pytest.mark.every(4)
+@pytest.mark.every(8)
 @pytest.mark.parametrize(
     ("session", "turns"), [(written, 2.5), (played, 2.9), (written, 3.0), (mode_and_target_played, 2.5)]
 )
@@ -68,6 +68,7 @@ def test_a_step_of_csp_within_the_limits_arrives(emulated, session, turns):
     assert theta[-1] == pytest.approx(turns, abs=0.02)
 
 
+@pytest.mark.every(5)
 @pytest.mark.parametrize("cycles", [15, 30, 45])
 def test_a_program_that_ends_within_a_step_leaves_the_axis_within_its_travel(emulated, cycles):
     """A quick stop at once, from 66 turns/s, ended at 5.23 turns."""
@@ -129,7 +130,7 @@ def test_a_mode_of_a_position_that_an_axis_cannot_come_to_rest_in_is_not_taken()
         assert int(emulated.read(0x6061)[0]) == 9
 
 
-@pytest.mark.every(2)
+@pytest.mark.every(6)
 @pytest.mark.parametrize("cycles", [0, 10, 60])
 def test_homing_begins_from_rest(emulated, cycles):
     """On its way back to a far set-point an axis was faster than homing ever is: its stop ended 5.4 turns outside."""
@@ -144,6 +145,7 @@ def test_homing_begins_from_rest(emulated, cycles):
         motion.select_mode(drives, "hm")
 
 
+@pytest.mark.every(2)
 def test_a_set_point_of_csp_that_another_mode_left_behind_is_no_way_to_go(emulated):
     """What pv did since csp counts: the axis is far from its last set-point of csp, and at rest."""
     emulated.machine.reset()
@@ -160,6 +162,7 @@ def test_a_set_point_of_csp_that_another_mode_left_behind_is_no_way_to_go(emulat
         motion.select_mode(drives, "hm")
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("device", ["tmcm6212", "tmcm3313"])
 def test_a_jump_that_a_stepper_cannot_follow_is_not_sent(device):
     """It lost its steps, and the stop that followed took the rotor more than a turn out of its travel."""

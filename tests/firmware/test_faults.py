@@ -90,6 +90,7 @@ def test_the_page_is_what_the_table_says():
 SCENARIOS = {"open_phase": {"friction": 0.04}, "supply_surge": {"load": "inertia"}}
 
 
+@pytest.mark.every(5)
 @pytest.mark.parametrize("name", WITH_EMERGENCY)
 def test_every_fault_does_what_its_row_says(name):
     """Its emergency comes within its detection time, the neighbour goes on, and the way back needs no new program."""

@@ -263,7 +263,7 @@ def test_an_axis_of_a_tgz_is_disabled_by_the_factory_s_rpdo_whatever_outputs_tra
     assert bus.plant.is_off(0)
 
 
-@pytest.mark.every(12)
+@pytest.mark.every(36)
 @pytest.mark.parametrize(
     ("name", "entry"),
     [
@@ -303,7 +303,7 @@ def test_no_value_in_a_mapped_image_voids_a_stop_before_or_behind_it(entry):
         bus.come_to_rest()
 
 
-@pytest.mark.every(2)
+@pytest.mark.every(6)
 @pytest.mark.parametrize("number", [n for n in SIZES if n < 0x1720], ids=lambda n: f"{n:04X}")  # with 6040h
 @pytest.mark.parametrize("name", ["tgz_d", "tgz_s"])
 def test_no_value_in_a_ready_made_image_voids_a_stop_of_either_axis(name, number):

@@ -204,6 +204,7 @@ ROWS = [  # transition of figure 4, from, controlword, to; None: the command cha
 ]
 
 
+@pytest.mark.every(7)
 @pytest.mark.parametrize("mode", [0, PP, PV, CST])  # tables 143, 182 and 278 are the same
 @pytest.mark.parametrize(("transition", "start", "controlword", "end"), ROWS)
 def test_controlword_moves_the_fsa_at_once(drives, transition, start, controlword, end, mode):
@@ -237,6 +238,7 @@ def test_transitions_0_and_1_come_with_power(drives):
 
 
 # --- all states x all patterns ----------------------------------------------------------------------------------------
+@pytest.mark.every(7)
 @pytest.mark.parametrize("high", [0x0000, 0xFF00])
 @pytest.mark.parametrize("before", [0x0000, 0x0080])
 @pytest.mark.parametrize(("start", "option"), [*((s, 2) for s in State), *((s, 5) for s in (OE, QSA))])
@@ -334,6 +336,7 @@ RECORDED = (0x6041, 0x6062, 0x606C)
 RAMPS = {1: SLOW_DOWN, 2: QUICK, 5: SLOW_DOWN, 6: QUICK}
 
 
+@pytest.mark.every(5)
 @pytest.mark.parametrize("mode", ["pp", "pv", "cst"])
 @pytest.mark.parametrize("option", [1, 2, 5, 6])
 def test_605ah_chooses_ramp_and_end_of_the_quick_stop(drives, option, mode):

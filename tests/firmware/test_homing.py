@@ -132,7 +132,7 @@ def test_recipe_of_section_8_3_homes_a_commissioned_drive_by_a_switch_that_is_pr
 
 
 # --- table 209: from everywhere to the edge ---------------------------------------------------------------------------
-@pytest.mark.every(2)
+@pytest.mark.every(4)
 @pytest.mark.parametrize("method", [17, 18, 19, 21])
 def test_every_method_ends_at_its_edge_from_every_region_at_rest(belt, method):
     bring(belt, STARTS)
@@ -142,7 +142,7 @@ def test_every_method_ends_at_its_edge_from_every_region_at_rest(belt, method):
     assert_homed(belt, EDGES[method])
 
 
-@pytest.mark.every(2)
+@pytest.mark.every(6)
 @pytest.mark.parametrize("direction", [-1, 1])
 @pytest.mark.parametrize("method", [17, 18, 19, 21])
 def test_every_method_ends_at_its_edge_from_every_region_while_moving(belt, method, direction):
@@ -165,6 +165,7 @@ def test_every_method_ends_at_its_edge_from_every_region_while_moving(belt, meth
     assert_homed(belt, EDGES[method])
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("method", [19, 21])
 @pytest.mark.parametrize("from_right", [False, True])
 def test_a_cam_of_any_width_gives_the_same_edge_whatever_braking_does(belt, method, from_right):
@@ -576,6 +577,7 @@ def test_limit_switches_stop_the_axis_again_in_other_modes(belt):
     assert (carriage(belt) > LEFT + 0.01).all()
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize(("method", "begins"), [(17, 0.0), (18, 0.0), (19, -0.15), (21, 0.1)])
 def test_the_sketch_of_a_method_turns_round_as_the_axis_does(belt, method, begins):
     """Its legs, and on which side of its switch it begins; 0.002 m are what settling may be."""

@@ -15,7 +15,7 @@ from rigs.world_bus import assert_equal, served
 from drive_env import EmulatedDrives, ObjectAccessError, motion
 
 
-@pytest.mark.every(6)
+@pytest.mark.every(18)
 @pytest.mark.parametrize("safety", [True, False], ids=["enveloped", "bare"])
 @pytest.mark.parametrize("name", SCRIPTS)
 def test_the_same_script_gives_the_same_integers(name, safety):

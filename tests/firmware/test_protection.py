@@ -285,6 +285,7 @@ def until_fault(drives: Drives, row: Row) -> list[int]:
     return words
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("name", ROWS)
 def test_fault_comes_by_its_cause_and_goes_after_it(name):
     row = ROWS[name]
@@ -556,6 +557,7 @@ def command(drives: Drives, mode: str, way: int) -> None:
         drives.write(0x60FF, way * 100_000, where=FIRST)
 
 
+@pytest.mark.every(7)
 @pytest.mark.parametrize("mode", ["pv", "pp", "csp", "csv", "cst"])
 @pytest.mark.parametrize("name", LIMITS)
 def test_axis_leaves_a_limit_but_goes_no_further(name, mode):

@@ -125,6 +125,7 @@ def test_a_load_s_set_varies_all_that_a_real_machine_varies_in(load):
     assert wanted | backlash <= set(laws)
 
 
+@pytest.mark.every(4)
 @pytest.mark.parametrize("load", sorted(LOADS))
 def test_a_load_s_set_draws_machines_within_the_row_that_can_run(load):
     drives = EmulatedDrives(load=load, num_machines=8, num_threads=1)

@@ -51,7 +51,7 @@ def check(load, num_machines):
         assert stable.mean() >= 0.95, f"{load}: {stable.mean():.1%} stable, emergencies {dict(causes)}"
 
 
-@pytest.mark.every(4)
+@pytest.mark.every(12)
 @pytest.mark.parametrize("load", sorted(LOADS))
 def test_a_hundred_random_machines_are_sound(load):
     check(load, 100)
@@ -63,7 +63,7 @@ def test_a_thousand_random_machines_are_sound(load):
     check(load, 1000)
 
 
-@pytest.mark.every(2)
+@pytest.mark.every(6)
 @pytest.mark.parametrize("load", sorted(LOADS))
 def test_the_ranges_are_drawn_to_their_ends(load):
     with warnings.catch_warnings():

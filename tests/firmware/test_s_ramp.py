@@ -147,6 +147,7 @@ CHANGES = {  # what changes 0.5 s after the start: target, and numbers of the ra
 }
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize("first_cycles", [180, 500])  # while it accelerates, and at speed
 def test_what_changes_in_flight_breaks_no_bow_and_ends_at_its_target(sign, first_cycles):

@@ -343,7 +343,7 @@ ERRORS = [
 REGISTER = {8: 0x02, 19: 0x02, 21: 0x02, 3: 0x04, 4: 0x04, 9: 0x08, 11: 0x08, 12: 0x10, 17: 0x10}  # manual, 1001h
 
 
-@pytest.mark.every(2)
+@pytest.mark.every(6)
 @pytest.mark.parametrize(("bit", "name", "code"), ERRORS)
 def test_each_error_of_the_table_is_a_row_and_can_be_set(drives, bit, name, code):
     row = next(cause for cause in CAUSES if cause.name == name)
@@ -492,6 +492,7 @@ CAUSED = [
 ]
 
 
+@pytest.mark.every(7)
 @pytest.mark.parametrize(("code", "make"), CAUSED)
 def test_an_error_has_its_physical_cause(drives, code, make):
     motion.enable(drives, mode="pv")

@@ -376,6 +376,7 @@ def test_the_way_back_is_read_again_before_anything_is_changed(target, tmp_path,
     assert take(target) == before
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize(
     ("spoil", "words", "unchecked"),
     [

@@ -54,6 +54,7 @@ def test_enabling_turns_no_motor(device, mode):
             assert way(drives, drives) < STILL, "in the mode that it has"
 
 
+@pytest.mark.every(7)
 @pytest.mark.parametrize(("device", "mode"), ROWS)
 def test_another_mode_turns_no_enabled_motor(device, mode):
     with EmulatedDrives(device, "inertia", num_threads=1) as drives:
@@ -63,6 +64,7 @@ def test_another_mode_turns_no_enabled_motor(device, mode):
         assert way(drives, drives) < STILL
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("mode", ["pv", "csv", "cst", "csp"])
 def test_nor_over_a_bus(mode):
     inside = EmulatedDrives("tmcm1636", "inertia", num_threads=1)

@@ -43,6 +43,7 @@ def second_implementation(readings, run, *, minimum, down, width, up, start):
     return found
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize(
     ("minimum", "down", "width", "up", "start"),
     [(0, 1, 0, 0, 5), (1, 2, 2, 1, 4), (1, 3, 0, 3, 6), (0, 3, 1, 2, 5), (0, 0, 0, 0, 3)],

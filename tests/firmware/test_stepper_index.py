@@ -69,7 +69,7 @@ def test_home_offset_is_the_position_of_zero_as_seen_from_the_index():
         assert drives.machine.rotor_angle[0] == pytest.approx(2.0, abs=LAG + COUNT)
 
 
-@pytest.mark.every(3)
+@pytest.mark.every(9)
 @pytest.mark.parametrize(
     ("method", "switch", "edge", "way"),
     [

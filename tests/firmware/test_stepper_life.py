@@ -38,7 +38,7 @@ def readable(drives):
         assert np.all((entry.low <= value) & (value <= entry.high)), entry.label
 
 
-@pytest.mark.every(2)
+@pytest.mark.every(6)
 @pytest.mark.parametrize("load", LOADS)
 def test_a_stepper_moves_every_load_in_every_mode(load):
     with build(load, "qsh8618_96", num_machines=2, randomise=True, seed=3) as drives:

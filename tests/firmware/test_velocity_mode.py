@@ -399,6 +399,7 @@ def rpm(drive):
     return float(drive.inside.records["omega_m"][0][0]) * 30.0 / np.pi
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("name", EDS)
 def test_our_master_turns_it_by_the_vendors_eds_and_brings_it_to_rest_before_it_is_off(on_a_bus, name):
     drive, master = on_a_bus(name)
@@ -619,6 +620,7 @@ def test_jog_says_what_keeps_a_drive_of_vl_from_turning(folders):
         assert code == 1 and abs(told["speed"]) < 3 and "the axis hardly moved" in why
 
 
+@pytest.mark.slow
 def test_jog_turns_a_drive_that_has_pv_too_in_pv(folders):
     with emulated(folders["vl and pv"]) as drive:
         code, told, _ = jog(drive, EDS["vl and pv"], "300", "--for", "0.4")

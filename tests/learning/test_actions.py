@@ -38,7 +38,7 @@ class Watched:
         return counted
 
 
-@pytest.mark.every(2)
+@pytest.mark.every(6)
 @pytest.mark.parametrize("value", NO_NUMBERS)
 @pytest.mark.parametrize("name", ENVIRONMENTS)
 def test_drives_of_a_bus_are_told_nothing(name, value):
@@ -56,6 +56,7 @@ def test_drives_of_a_bus_are_told_nothing(name, value):
         env.step(np.zeros_like(action))  # the episode goes on
 
 
+@pytest.mark.every(4)
 @pytest.mark.parametrize("value", NO_NUMBERS)
 @pytest.mark.parametrize("name", ENVIRONMENTS)
 def test_emulated_environments_refuse_it_too(name, value):

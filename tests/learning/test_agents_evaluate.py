@@ -35,6 +35,7 @@ from drive_env.bus.world import World
 from drive_env.envs.gain_observation import IDENTIFIED
 from drive_env.envs.gain_tuning import GainTuning, GainTuningConfig
 
+pytestmark = pytest.mark.usefixtures("files_read_here")
 SHORT = {"load": "two_mass", "mode": "csp", "action": "offset", "duration": 0.05}
 SCORE = "RMS following error [rev]"
 TURN = 65536
@@ -175,6 +176,7 @@ class Bold(Gentle):
         return ([*self.seen, observation][self.trial][:, last] - observation[:, best]) / GainTuningConfig().step
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("trial", [0, 1, 3])
 def test_a_tuner_is_judged_by_its_own_answer_not_by_the_incumbent(trial):
     """What the environment told of that trial, on drawn machines and on given drives."""
@@ -559,7 +561,7 @@ def test_the_gap_as_a_command(tmp_path):
 
 
 # --- ONNX -------------------------------------------------------------------------------------------------------------
-@pytest.mark.every(5)
+@pytest.mark.every(10)
 @pytest.mark.parametrize("kind", ["mlp", "lstm"])
 @pytest.mark.parametrize(("activation", "output"), [("tanh", "clip"), ("relu", "tanh"), ("elu", "clip"),
                                                     ("silu", "tanh"), ("leaky_relu", "clip")])  # fmt: skip
@@ -620,6 +622,7 @@ class Elsewhere:
             yield k, pickle.loads(pickle.dumps(task[0](task[1])))
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("policy", ["agent.npz", "feed_forward", "tracking_two_mass", "test_agents_evaluate:gentle"])
 def test_rounds_elsewhere_give_the_same_files(policy, tmp_path, monkeypatch):
     monkeypatch.setattr("agents.evaluation.evaluation.LANES", 2)

@@ -35,18 +35,28 @@ def trials(machines=1_000, count=6, seed=0):
     return TrialData(*(column.astype(np.float32) for column in (context, gains, shown, worth)))
 
 
-@pytest.fixture(scope="module")
-def bundle():
+def fitted(epochs):
     fitting = pytest.importorskip("research.surrogate_fit", reason="fitting takes torch", exc_type=ImportError)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(fitting, "BATCH", 32)  # many steps for little data
-        patch.setattr(fitting, "EPOCHS", 30)
+        patch.setattr(fitting, "EPOCHS", epochs)
         return training.bundle_of(RECIPE, fitting.fit(trials(), RECIPE.reach, 0, 2), {})
+
+
+@pytest.fixture(scope="module")
+def bundle():
+    """A tuner that has hardly learnt: for what holds of any."""
+    return fitted(1)
 
 
 @pytest.fixture
 def policy(bundle):
     return SurrogatePolicy(bundle)
+
+
+@pytest.fixture(scope="module")
+def learnt():
+    return SurrogatePolicy(fitted(30))
 
 
 def observation(lanes, seed=1):
@@ -128,17 +138,17 @@ def test_neither_the_order_of_trials_matters_nor_what_is_not_known(policy):
 
 
 @pytest.mark.slow
-def test_training_learns_to_foresee_from_other_trials_and_to_judge_a_trial_by_itself(policy):
+def test_training_learns_to_foresee_from_other_trials_and_to_judge_a_trial_by_itself(learnt):
     """The mean error of ln J over machines not trained on: nothing known, others known, the trial itself known."""
     test = trials(200, seed=5)
     asked = test.gains[:, -1:]
 
     def error(known):
-        policy.reset()
-        policy._take(after(np.zeros((200, G))))
+        learnt.reset()
+        learnt._take(after(np.zeros((200, G))))
         for k in known:
-            policy._take(after(test.gains[:, k], shown=test.shown[:, k, :G]))
-        return np.abs(policy._ask(policy._read(), asked)[0] - test.worth[:, -1:]).mean()
+            learnt._take(after(test.gains[:, k], shown=test.shown[:, k, :G]))
+        return np.abs(learnt._ask(learnt._read(), asked)[0] - test.worth[:, -1:]).mean()
 
     nothing, others, itself = error([]), error(range(5)), error(range(6))
     assert others < 0.7 * nothing
@@ -185,7 +195,7 @@ def test_curiosity_seeks_what_is_not_known(bundle, monkeypatch):
 
 
 @pytest.mark.slow
-def test_it_finds_what_only_trials_tell(policy):
+def test_it_finds_what_only_trials_tell(learnt):
     """Machines of the kind that was trained on, in five trials: each says where to look next."""
     best = np.random.default_rng(6).uniform(-1.0, 1.0, (30, 1, G))[:, 0]
     tried = np.zeros((30, G))
@@ -193,7 +203,7 @@ def test_it_finds_what_only_trials_tell(policy):
     for _ in range(6):
         distance.append(np.abs(tried - best).sum(axis=1))
         shown = tried - best if np.any(tried) else 0.0  # the rule's trial shows nothing
-        tried = training.STEP * policy.act(after(tried, shown=shown))  # the rule stays the incumbent
+        tried = training.STEP * learnt.act(after(tried, shown=shown))  # the rule stays the incumbent
     assert np.mean(distance[3]) < 0.6 * np.mean(distance[1])
     assert np.mean(np.min(distance[1:], axis=0)) < 0.4 * np.mean(distance[0])
 

@@ -39,7 +39,7 @@ def test_feed_forward_is_lag_times_motion(mode, lags, action):
 
 
 # --- what ships -------------------------------------------------------------------------------------------------------
-@pytest.mark.every(2)
+@pytest.mark.every(4)
 @pytest.mark.parametrize("name", CONTROLLERS)
 def test_the_shipped_controllers_perform_as_their_cards_say(name):
     made = AgentFile.load(shipped(name))

@@ -500,6 +500,7 @@ def test_trials_elsewhere_are_those_of_one_process(tmp_path, monkeypatch):
         assert one.read_bytes() == other.read_bytes(), name
 
 
+@pytest.mark.slow
 def test_what_a_round_draws_follows_from_the_rounds_before_wherever_it_runs(tmp_path, monkeypatch):
     """Optuna's sampler draws at random until it knows ten trials: the thirteenth and later ones tell."""
 

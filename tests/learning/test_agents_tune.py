@@ -267,6 +267,7 @@ def test_a_proposal_that_breaks_the_margins_is_not_tried_and_that_is_said(tmp_pa
         assert tuple(axis.after) == tuple(gains(target)[0])
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize(("models", "reason"), [
     (lambda *_: [], "every trial was stopped, the baseline rule's too"),
     (unstable, "none of the trials keeps standard dynamics by the identified plant"),

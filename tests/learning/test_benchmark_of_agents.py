@@ -266,7 +266,7 @@ def test_worker_processes_change_no_score(benchmark, tmp_path):
 SHIPPED = hyperparameters.FOLDER
 
 
-@pytest.mark.every(24)
+@pytest.mark.every(48)
 @pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize("algorithm", ["ppo", "recurrent_ppo", "sac", "crossq"])
 def test_the_hyperparameters_that_ship_train_on_every_task(algorithm, task, tmp_path, monkeypatch):
@@ -312,6 +312,7 @@ def taught(task, monkeypatch):
     return teacher
 
 
+@pytest.mark.slow
 def test_a_teacher_is_told_the_machine_of_each_episode(monkeypatch):
     found = taught(TASK, monkeypatch)
     assert found.begun.tolist() == [3, 3] and len(found.inertia) == 6

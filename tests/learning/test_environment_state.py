@@ -215,6 +215,7 @@ def test_a_state_of_other_drives_is_refused():
 
 
 # --- what a reset may be given ----------------------------------------------------------------------------------------
+@pytest.mark.every(3)
 @A_FEW_CASES
 def test_a_reset_to_a_state_returns_what_was_seen_there_and_goes_on(kind, options):
     with made(kind, options, 3) as environments, made(kind, options, 3) as others:

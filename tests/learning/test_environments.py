@@ -91,7 +91,7 @@ def mend_machine(lanes):
 
 
 # --- the interface ----------------------------------------------------------------------------------------------------
-@pytest.mark.every(4)
+@pytest.mark.every(12)
 @EVERY_KIND_AND_LOAD
 def test_the_checkers_of_gymnasium_and_stable_baselines_find_nothing_to_say(kind, load):
     from stable_baselines3.common.env_checker import check_env as check_for_stable_baselines

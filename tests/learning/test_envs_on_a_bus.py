@@ -50,6 +50,7 @@ def assert_same(one, other):
         np.testing.assert_array_equal(found, expected)
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize(
     ("load", "how"),
     [
@@ -73,6 +74,7 @@ def test_tracking(load, how):
     inside.close()
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("mode", ["csp", "csv"])
 @EVERY_LOAD
 def test_gain_scheduling(load, mode):
@@ -85,6 +87,7 @@ def test_gain_scheduling(load, mode):
     inside.close()
 
 
+@pytest.mark.every(3)
 @EVERY_LOAD
 def test_gain_tuning(load):
     """Drives that are given are taken as they are, in process too: nothing is drawn, nothing hidden is known."""

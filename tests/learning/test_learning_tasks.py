@@ -37,6 +37,7 @@ QUICK = [
 UNLEARNT, LEAST, MOST = 0.6, 0.7, 0.95  # score of what has learnt nothing at most; of the expert
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("name", TASKS)
 def test_a_task_has_its_horizon_and_its_threshold_in_the_spec_and_takes_no_options(name):
     task = TASKS[name]
@@ -83,14 +84,14 @@ def digest(name):
     return hashlib.sha256(content.encode()).hexdigest()[:16]
 
 
-@pytest.mark.every(8)
+@pytest.mark.every(16)
 @pytest.mark.parametrize("name", QUICK)
 def test_what_has_learnt_nothing_scores_less_than_0_6(name):
     scores = unlearnt_scores(name, MACHINES[TASKS[name].environment])
     assert max(scores.values()) < UNLEARNT, scores
 
 
-@pytest.mark.every(24)
+@pytest.mark.slow
 @pytest.mark.parametrize("name", QUICK)
 def test_the_cascade_scores_less_than_0_6_and_the_expert_0_7_to_0_95(name):
     scores = {}

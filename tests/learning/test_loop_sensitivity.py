@@ -35,6 +35,7 @@ def measured(agent: AgentFile, machines: int = 2):
     return measure_sensitivity(policy_of(agent), agent.environment, agent.configuration, machines=machines, seed=3)
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("load", ["inertia", "two_mass"])
 def test_loops_without_an_agent_are_those_of_the_linear_model(load):
     """At the torque, L of both outer loops: 1 + L = (1 + L of the velocity loop) (1 + L of the position loop)."""

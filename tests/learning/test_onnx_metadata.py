@@ -12,6 +12,8 @@ from agents.policies.onnx_policy import METADATA, OnnxPolicy
 from agents.policies.policy import load_policy
 from agents.shipped import shipped
 
+pytestmark = pytest.mark.usefixtures("files_read_here")
+
 pytest.importorskip("onnxruntime")
 onnx = pytest.importorskip("onnx")
 
@@ -51,6 +53,7 @@ def test_metadata_of_ours_and_none_are_taken(exported, tmp_path):
     assert OnnxPolicy(plain).environment is None and OnnxPolicy(plain).card == {}
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("content", [b"", b"no", bytes(1000)])
 def test_what_is_no_model_is_told(content, tmp_path):
     (tmp_path / "odd.onnx").write_bytes(content)

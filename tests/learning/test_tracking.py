@@ -108,6 +108,7 @@ def test_a_toml_file_configures(tmp_path):
 
 # --- one environment among many
 # ----------------------------------------------------------------------------------------------
+@pytest.mark.every(3)
 @pytest.mark.parametrize("load", LOADS)
 def test_a_lane_is_the_same_alone_and_among_others(load):
     axes = 2 if load == "gantry" else 1
@@ -220,6 +221,7 @@ def pole_feedback(drives):
     return K
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("options", [{}, {"rate": 500}, {"delay": 3}, {"distributions": "inverted_pendulum"}], ids=str)
 def test_a_state_feedback_keeps_the_pole_up(options):
     """That the task can be done with what is observed, also on machines that the feedback was not made for."""
@@ -404,7 +406,7 @@ def test_a_configuration_takes_the_loads_own_task():
 STILL = {"inertia": 1, "belt": 1, "portal": 3}
 
 
-@pytest.mark.every(2)
+@pytest.mark.every(6)
 @pytest.mark.parametrize("load", STILL)
 @pytest.mark.parametrize("device", ["tmcm6212", "tmcm3313"])
 @pytest.mark.parametrize(("mode", "action"), [("csp", "offset"), ("csv", "offset"), ("csp", "direct")])

@@ -41,7 +41,7 @@ def is_quick(device, load, motor):
     return not own.variant_of and load == THREE_LOADS[list(own.motors).index(motor) % len(THREE_LOADS)]
 
 
-@pytest.mark.every(16)
+@pytest.mark.every(48)
 @pytest.mark.parametrize(
     ("device", "load", "motor"),
     [pytest.param(*row, id="-".join(row), marks=[] if is_quick(*row) else [pytest.mark.slow]) for row in ROWS],

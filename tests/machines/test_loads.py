@@ -108,6 +108,7 @@ def amplitude(signal, t, sweep):
     return 2 * np.abs((signal * window * np.exp(-2j * np.pi * t[:, None] * sweep)).sum(axis=0)) / window.sum()
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize(
     ("name", "axis", "resonances", "damping"),
     [
@@ -275,7 +276,7 @@ def is_stop(name):
     return np.array([not contact.transmits for contact in LOADS[name].contacts], bool)
 
 
-@pytest.mark.every(4)
+@pytest.mark.every(12)
 @pytest.mark.parametrize("friction", list(FRICTION_MODELS))
 @pytest.mark.parametrize("name", list(LOADS))
 def test_energy_is_accounted_for_at_16_steps_per_millisecond(name, friction):
@@ -288,7 +289,7 @@ def test_energy_is_accounted_for_at_16_steps_per_millisecond(name, friction):
         assert error < 1e-3
 
 
-@pytest.mark.every(4)
+@pytest.mark.every(12)
 @pytest.mark.parametrize("friction", list(FRICTION_MODELS))
 @pytest.mark.parametrize("name", list(LOADS))
 def test_energy_is_accounted_for_at_the_default_step_within_the_bound_of_the_row(name, friction):

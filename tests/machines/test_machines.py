@@ -15,6 +15,7 @@ from mechanics.load import Friction, Load
 from mechanics.loads import LOADS, find_load
 from mechanics.packed import PackedLoad
 
+pytestmark = pytest.mark.usefixtures("files_read_here")
 TURN = 65536  # increments
 H = 200e-6
 G = 9.81
@@ -95,6 +96,7 @@ def test_dry_friction_holds_an_arm_askew_up_to_its_gravity(coulomb, holds):
             assert moved > 0.02
 
 
+@pytest.mark.every(5)
 @pytest.mark.parametrize("friction", ["none", "stribeck", "lugre"])
 @pytest.mark.parametrize(("load", "force"), [("robot", 0.0), ("gantry", 20.0), ("vertical_screw", 0.0), ("belt", 10.0)])
 def test_brakes_of_coupled_axes_hold_without_creep(load, force, friction):
@@ -110,7 +112,7 @@ def test_brakes_of_coupled_axes_hold_without_creep(load, force, friction):
 
 
 # --- backlash ---------------------------------------------------------------------------------------------------------
-@pytest.mark.every(2)
+@pytest.mark.every(4)
 @pytest.mark.parametrize(
     ("load", "ratio", "gap", "turns", "friction", "stiffness"),
     [  # ratio: output per rotor angle; gap as a multiple of the row's; friction that the output needs

@@ -36,8 +36,8 @@ RELIES_ON = {
 
 def private_parts(path):
     """What a file imports of Numba's private parts, as module and name; a module that is imported is its name alone."""
-    found = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    found, text = set(), path.read_text(encoding="utf-8")
+    for node in ast.walk(ast.parse(text)) if "numba" in text or "llvmlite" in text else ():
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(PRIVATE):
             found |= {f"{node.module} {alias.name}" for alias in node.names}
         elif isinstance(node, ast.Import):

@@ -100,7 +100,7 @@ def assert_a_copy_is_itself_alone(name, integrator, friction, copies, **options)
     return packed
 
 
-@pytest.mark.every(8)
+@pytest.mark.every(24)
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.parametrize("name", list(LOADS))
 @pytest.mark.parametrize(("copies", "friction"), [(8, "stribeck"), (64, "lugre")])
@@ -109,7 +109,7 @@ def test_a_copy_is_bit_for_bit_the_load_alone(name, integrator, copies, friction
     assert_a_copy_is_itself_alone(name, integrator, friction, copies)
 
 
-@pytest.mark.every(4)
+@pytest.mark.every(12)
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 @pytest.mark.parametrize("name", END_STOPS)
 @pytest.mark.parametrize(("copies", "friction"), [(8, "lugre"), (64, "stribeck")])
@@ -137,7 +137,7 @@ def test_a_template_gives_the_same_model_and_shares_no_memory():
     assert np.array_equal(first.get("inertia"), values["inertia"])
 
 
-@pytest.mark.every(3)
+@pytest.mark.every(9)
 @pytest.mark.parametrize("friction", ["stribeck", "lugre"])
 @pytest.mark.parametrize("name", list(LOADS))
 def test_machines_packed_at_once_are_those_packed_one_by_one(name, friction, monkeypatch):
@@ -182,6 +182,7 @@ def test_what_follows_from_masses_is_what_mujoco_finds(name):
     assert changed[0] == changed[1]
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("load", ["two_mass", "gantry"])
 def test_many_machines_in_fewer_models_are_the_same_machines(load, monkeypatch):
     records, models = [], []
@@ -341,7 +342,7 @@ def test_a_model_is_compiled_anew_where_the_load_has_changed(change, tmp_path):
         assert list(second.turning[0].values()) == [3.0]
 
 
-def test_a_model_that_takes_in_other_files_is_always_read(tmp_path):
+def test_a_model_that_takes_in_other_files_is_always_read(files_read_here, tmp_path):
     (tmp_path / "body.xml").write_text(LOADS["inertia"].mjcf.read_text())
     file = tmp_path / "whole.xml"
     file.write_text('<mujoco><include file="body.xml"/></mujoco>')

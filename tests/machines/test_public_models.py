@@ -32,7 +32,7 @@ from mechanics.shaft import shaft_load
 from tuning.auto.one_button import auto
 from tuning.target import emulated
 
-pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
+pytestmark = [pytest.mark.usefixtures("files_read_here"), pytest.mark.filterwarnings("ignore::UserWarning")]
 
 LAYOUTS = TESTS / "data" / "public_layouts"
 SCARA = ROOT / "examples" / "models" / "scara.xml"
@@ -80,6 +80,7 @@ def run(*arguments):
 
 
 # --- the ten layouts --------------------------------------------------------------------------------------------------
+@pytest.mark.every(3)
 @pytest.mark.parametrize("name", JOINTS)
 def test_every_joint_is_driven_or_refused_by_its_reason(name, layouts):
     found = {row.name: row for row in joint_loads(Load(layouts / name))}
@@ -128,6 +129,7 @@ def middle(row):
     return sum(row["range"]) / 2.0 if row["range"] else math.inf
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize(
     ("name", "says"),
     [
@@ -164,6 +166,7 @@ COMPILERS = ["", '<compiler inertiafromgeom="true"/>', '<compiler inertiagroupra
 ARRAYS = ("body_mass", "body_inertia", "body_ipos", "body_iquat")
 
 
+@pytest.mark.every(7)
 @pytest.mark.parametrize("inertial", ["", '<inertial pos="0 .1 0" mass="2" diaginertia=".1 .1 .1"/>'])
 @pytest.mark.parametrize(("shape", "size"), [("box", 'size=".1 .2 .3"'), ("mesh", 'mesh="m"')])
 @pytest.mark.parametrize("compiler", COMPILERS)

@@ -36,6 +36,7 @@ from mechanics.load import Load, Switch
 from mechanics.loads import LOADS, find_load
 from mechanics.shaft import one, way
 
+pytestmark = pytest.mark.usefixtures("files_read_here")
 SMALL = PictureFormat(width=640, height=360)
 
 
@@ -116,7 +117,7 @@ def belt_run():
 
 
 # --- what is filmed ---------------------------------------------------------------------------------------------------
-@pytest.mark.every(5)
+@pytest.mark.every(15)
 @pytest.mark.parametrize("load", LOADS)
 def test_default_run_moves_there_and_back_and_then_the_load_pushes(load):
     run = perform(Demonstration(load=load))
@@ -360,7 +361,7 @@ def test_traces_appear_up_to_the_time_and_no_further():
     assert (half[:, middle + 2 :] == empty[:, middle + 2 :]).all()
 
 
-@pytest.mark.every(3)
+@pytest.mark.every(9)
 @pytest.mark.parametrize(("width", "height", "scale"), [(480, 506, 1.0), (320, 337, 0.67), (960, 1012, 2.0)])
 @pytest.mark.parametrize("axes", [1, 6, 8])
 def test_nothing_of_the_scope_is_cut_off(width, height, scale, axes):

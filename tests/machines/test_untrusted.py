@@ -79,6 +79,7 @@ def test_toml_within_limits(text):
     assert "\n" not in str(told.value)
 
 
+@pytest.mark.every(5)
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 @pytest.mark.parametrize("text", [text for text in HOSTILE_TOML.values() if text is not DIGITS])
 def test_what_would_be_large_is_refused_before_tomllib_begins(text, monkeypatch, memory):

@@ -206,6 +206,7 @@ class WorldPort(NodePort):
         return super().receive(timeout, done)
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize(("lockstep", "bit_rate"), [(True, 1_000_000), (False, 1_000_000), (False, 125_000)])
 def test_the_eds_over_a_bus(drives, lockstep, bit_rate):
     """36 kB: no buffer overflows at any bit rate, in lockstep neither."""

@@ -57,6 +57,7 @@ def memory():
     resource.setrlimit(resource.RLIMIT_DATA, before)
 
 
+@pytest.mark.every(7)
 @pytest.mark.parametrize(("name", "arguments", "told"), COMMANDS, ids=lambda value: "" if value is None else str(value))
 def test_an_option_that_cannot_be_ends_with_a_line(name, arguments, told, tmp_path, monkeypatch, memory):
     monkeypatch.chdir(tmp_path)
@@ -104,7 +105,7 @@ def test_a_replay_waits_for_no_stamp_that_never_comes(stamp, ending, tmp_path, m
         assert found.output.strip().count("\n") == 0
 
 
-def test_a_replay_goes_at_the_pace_of_its_stamps(tmp_path):
+def test_a_replay_goes_at_the_pace_of_its_stamps(files_read_here, tmp_path):
     file = tmp_path / "frames.log"
     file.write_text("(1e6) can0 601#4041600000000000\n(1000000.01) can0 601#4041600000000000\n")
     found = CliRunner().invoke(env_app, ["frames", "replay", str(file), "--interface", "virtual", "--channel", "x"])
@@ -153,7 +154,7 @@ def retyped(path, index, kind):
     return path
 
 
-@pytest.mark.every(4)
+@pytest.mark.every(12)
 @pytest.mark.parametrize("kind", ["0x000F", "0x0009", "0x0008", "0x0011", "0x001B", "0x0005"])
 @pytest.mark.parametrize("index", [index for index, _ in KINDS if index != 0x605A])
 def test_an_eds_whose_objects_are_of_another_kind_is_refused(index, kind, tmp_path):

@@ -260,14 +260,14 @@ def test_a_dead_master_is_noticed_by_the_process_data_watchdog(caplog):
 
 
 def test_a_program_that_computes_is_no_dead_master_and_one_that_ends_gives_the_watchdog_back():
-    with linked(Limits(silence=0.4), "real-time") as (drives, bus):
+    with linked(Limits(silence=0.3), "real-time") as (drives, bus):
         motion.enable(drives, mode="csv")
-        time.sleep(0.9)  # the supervisor is heard meanwhile
+        time.sleep(0.5)  # the supervisor is heard meanwhile
         assert cia402.matches(int(drives.read(0x6041)[0]), cia402.OPERATION_ENABLED)
         assert bus.nodes[0].state is State.OP
         motion.disable(drives)
         drives.link.sync = lambda: None  # nobody looks at an axis that is off often enough for its watchdog
-        time.sleep(0.9)
+        time.sleep(0.5)
         assert bus.nodes[0].state is State.OP
     assert bus.nodes[0].watchdog == 0.0
 

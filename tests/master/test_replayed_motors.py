@@ -20,6 +20,7 @@ from drive_env.commands import replayed_motors
 from drive_env.commands.cli import app
 from drive_env.commands.replayed_motors import nodes_spoken_to
 
+pytestmark = pytest.mark.usefixtures("files_read_here")
 DONE, REFUSED, USER_ERROR, INTERRUPTED = 0, 1, 2, 130
 OFF, ENABLED, QUICK_STOP = 0x0240, 0x0637, 0x0607
 SPEED = 1_000_000  # inc/s
@@ -116,7 +117,7 @@ def replay(*arguments, timeout=0.05):
     return result.exit_code, result.stdout, result.stderr
 
 
-@pytest.mark.every(2)
+@pytest.mark.every(4)
 @pytest.mark.parametrize("frames", [enabled_by_sdo(), BY_RPDO, [START, *enabled_by_sdo()]], ids=["SDO", "RPDO", "both"])
 def test_what_is_enabled_at_the_end_is_stopped_and_said(bus, tmp_path, frames):
     drive = Turning()
@@ -267,7 +268,7 @@ def test_a_bus_that_is_lost_is_not_called_safe(bus, tmp_path, monkeypatch):
     assert (code, "the motors of node 1 may be running" in error) == (REFUSED, True)
 
 
-@pytest.mark.every(3)
+@pytest.mark.every(6)
 @pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
 @pytest.mark.parametrize("number", ["SIGINT", "SIGTERM", "SIGHUP"])
 @pytest.mark.parametrize("times", [1, 3])
@@ -331,7 +332,7 @@ def test_a_drive_watches_over_the_program_meanwhile_and_gets_back_what_it_had(bu
     assert beats and set(beats) == {b"\5"}
 
 
-@pytest.mark.every(4)
+@pytest.mark.every(8)
 @pytest.mark.parametrize(
     ("values", "frames", "why"),
     [

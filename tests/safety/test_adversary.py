@@ -40,7 +40,7 @@ from drive_env import Limits
 from drive_env.cia402 import State
 from drive_env.cores import usable_cores
 
-SAMPLE, MANY = 20, part(300, 40)
+SAMPLE, MANY = 12, part(300, 40)
 PATIENCE = 60.0  # s
 ON, OFF = 4, 1  # of the automaton
 

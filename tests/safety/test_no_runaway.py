@@ -299,6 +299,7 @@ def test_a_stop_from_another_thread_while_nothing_is_enabled_does_nothing(emulat
 
 
 def test_what_is_read_before_the_first_enable_may_take_longer_than_the_drive_waits_for_its_master(emulated):
+    silence = 0.25  # s
     with bench(emulated) as (world, bus):
         passed = []  # when 1016h was set, and when the first controlword went out [s]
 
@@ -309,9 +310,9 @@ def test_what_is_read_before_the_first_enable_may_take_longer_than_the_drive_wai
                 time.sleep(0.02)
 
         bus.meets = slow_answers
-        error = run(bus, lambda drives: turn_at(drives, SLOW), safety=Limits())
+        error = run(bus, lambda drives: turn_at(drives, SLOW), safety=Limits(silence=silence))
         assert len(passed) >= 2, error
-        assert passed[1] - passed[0] > Limits().silence  # or nothing is shown
+        assert passed[1] - passed[0] > silence  # or nothing is shown
         ended_well(world)
 
 
@@ -342,6 +343,7 @@ def test_the_second_of_two_axes_falls_silent(when):
         ended_well(world)
 
 
+@pytest.mark.slow
 def test_a_drive_found_enabled_is_commanded_and_the_program_dies(emulated):
     with bench(emulated) as (world, bus):
         other = OtherMaster(bus.channel)

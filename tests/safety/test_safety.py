@@ -378,16 +378,16 @@ def test_a_program_may_take_its_time_while_no_axis_is_enabled(bus):
     with CanDrives(bus=bus, safety=Limits(stall=0.5)) as drives:
         motion.enable(drives, mode="csv")
         motion.disable(drives)
-        time.sleep(1.0)
+        time.sleep(0.7)
         drives.read(0x6041)
         assert 2 not in sent_controlwords(bus)
 
 
 def test_waiting_and_recording_is_no_stall(bus):
-    with CanDrives(bus=bus, safety=Limits(stall=0.5)) as drives:
+    with CanDrives(bus=bus, safety=Limits(stall=0.3)) as drives:
         motion.enable(drives, mode="csv")
-        drives.advance(0.8)
-        drives.record([0x6041], 0.8)
+        drives.advance(0.5)
+        drives.record([0x6041], 0.5)
         assert 2 not in sent_controlwords(bus)
 
 
@@ -440,7 +440,10 @@ while True:
 """
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL], ids=["Ctrl-C", "kill -9"])
+@pytest.mark.parametrize(
+    "number",
+    [pytest.param(signal.SIGINT, id="Ctrl-C", marks=pytest.mark.slow), pytest.param(signal.SIGKILL, id="kill -9")],
+)
 def test_a_program_that_ends_leaves_no_turning_axis(number):
     """Ctrl-C is stopped by the program on its way out, a killed one by the drive that misses its heartbeat."""
     world = World(lockstep=False)

@@ -541,7 +541,10 @@ class Session:
         return Seen(state, self.node.state, self.node.dictionary.port(0x1016, 1).read() != 0)
 
 
-LONG = {"killed before it enabled", "disabled by its program", "8Fh while enabled", "ready only"}
+LONG = {
+    "killed before it enabled", "disabled by its program", "8Fh while enabled", "ready only",
+    "81h of another master, enabled again, killed",
+}  # fmt: skip
 MARKS = {name: [pytest.mark.slow] for name in SCRIPTS if name.startswith("82h")}
 MARKS |= {name: [pytest.mark.slow] for name in LONG}
 

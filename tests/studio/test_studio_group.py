@@ -40,6 +40,7 @@ def begin(session, axes, page, speed="300 rpm"):
     return number
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("axes", [[1], GROUP, ALL])
 def test_axes_are_enabled_and_disabled_together_and_the_others_are_let_alone(session, axes):
     session.do(motion_jobs.disable(ALL), "disable").result(10)
@@ -63,6 +64,7 @@ def test_a_group_turns_together_as_long_as_its_page_holds_it(session):
         assert enabled(session).all()
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("way", ["silent", "closed", "fault"])
 def test_all_axes_of_a_group_stop_where_one_is_lost_or_its_page_is(session, way):
     with Beats(session) as page:

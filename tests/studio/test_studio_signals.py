@@ -71,6 +71,7 @@ def play(session, name, axis=0, **settings):
 
 
 # --- what is played -----------------------------------------------------------------------------------------------
+@pytest.mark.every(3)
 @pytest.mark.parametrize("name", SIGNALS)
 def test_a_signal_does_what_its_row_says_and_leaves_mode_state_and_rest_as_before(session, truth, name):
     _, quantity, low, high = PEAKS[SIGNALS[name].target]
@@ -137,6 +138,7 @@ LIMITED = {
 }
 
 
+@pytest.mark.every(4)
 @pytest.mark.parametrize(("name", "settings", "message"), LIMITED.values(), ids=LIMITED)
 def test_what_would_leave_a_limit_is_refused_and_moves_nothing(session, truth, name, settings, message):
     before = inside(session, "theta_m")
@@ -197,6 +199,7 @@ def test_a_free_axis_that_a_current_would_take_away_is_stopped(session, truth, s
     assert abs(inside(session, "theta_m") - truth["theta_m"][0]) < 1.5 * REV
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("name", ["velocity_sweep", "load_step"])
 def test_a_page_that_is_gone_ends_its_signal(session, truth, name):
     settings = SignalSettings(name, PEAKS[SIGNALS[name].target][0], lasts=9.0, held=1.0)

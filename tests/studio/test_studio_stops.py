@@ -97,7 +97,7 @@ def test_a_button_that_is_released_ends_the_jog(driver, bench):
     assert world.truth.is_on().all()  # it stays enabled
 
 
-@pytest.mark.every(2)
+@pytest.mark.slow
 @pytest.mark.parametrize("way", ["button", "space"])
 def test_quick_stop(driver, bench, way):
     world, _ = bench

@@ -83,7 +83,7 @@ def parameters(emulated):
 
 
 # --- every page ---------------------------------------------------------------------------------------------------
-@pytest.mark.every(3)
+@pytest.mark.slow
 @pytest.mark.parametrize("path", PAGES)
 def test_a_page_opens_without_an_error_from_this_computer_alone_and_every_control_has_a_name(tab, path):
     tab.open(path)

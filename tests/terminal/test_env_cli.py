@@ -176,6 +176,7 @@ def test_get_raw_several_nodes_texts_and_json(run):
     assert [rows[0][key] for key in ("node", "index", "sub", "raw")] == [1, "607D", 2, 2**31 - 1]
 
 
+@pytest.mark.every(7)
 @pytest.mark.parametrize(
     ("arguments", "code", "text"),
     [
@@ -710,8 +711,9 @@ def test_a_logged_session_replays_the_masters_frames(run, shared, tmp_path, endi
     run("set", "6081", "2184533")
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("ending", ["log", "blf", "db"])
-def test_a_broken_log_is_told(run, tmp_path, ending):
+def test_a_broken_log_is_told(files_read_here, run, tmp_path, ending):
     path = tmp_path / f"broken.{ending}"
     path.write_text("rubbish\n", encoding="utf-8")
     code, _, error = run("frames", "replay", path)
@@ -725,6 +727,7 @@ COMMANDS += [[name, *more] for groups in GROUPS.values() for name, group in grou
              for more in ([], *([row.name or row.callback.__name__] for row in group.registered_commands))]  # fmt: skip
 
 
+@pytest.mark.every(7)
 @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
 def test_every_command_explains_itself(command):
     result = CliRunner().invoke(app, [*command, "--help"], env={"COLUMNS": "200"})

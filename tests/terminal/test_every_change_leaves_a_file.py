@@ -153,6 +153,7 @@ def test_a_place_that_cannot_be_written_is_told_before_the_bus_is_opened(tmp_pat
     assert len(done.stderr.strip().splitlines()) == 1
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize(("command", "out", "file"), [
     ("identify", "found.json", "found-before.toml"),
     ("response", "shaken", "shaken-before.toml"),

@@ -52,6 +52,7 @@ def jam(drives):
     drives.advance(0.1)
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize(("spoil", "name"), [
     (lambda drives: jam(drives), "following error"),
     (lambda drives: setattr(drives.machine, "supply", 0.0), "undervoltage"),

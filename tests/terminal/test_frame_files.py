@@ -22,6 +22,7 @@ from drive_env.commands.cli import app
 from drive_env.commands.frame_files import FrameFile, FrameLines
 from drive_env.master.can import port
 
+pytestmark = pytest.mark.usefixtures("files_read_here")
 FRAMES = {
     "data": can.Message(timestamp=1.5, arbitration_id=0x181, data=b"\x37\x02", is_extended_id=False),
     "sent by this program": can.Message(
@@ -179,6 +180,7 @@ def test_captures_are_read_as_wireshark_writes_them(tmp_path, kinds):
     ]  # fmt: skip
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("ending", [".pcap", ".pcapng"])
 def test_a_capture_of_ours_comes_back_and_one_that_is_cut_off_is_refused(tmp_path, ending):
     whole = write(tmp_path / f"a{ending}", [FRAMES["data"], FRAMES["empty"]])
@@ -365,6 +367,7 @@ def test_a_log_names_what_its_format_has_no_room_for(tmp_path, monkeypatch, endi
         assert len(list(reader)) == kept
 
 
+@pytest.mark.every(2)
 @pytest.mark.skipif(os.name != "posix", reason="signals are otherwise there")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_log_in_the_background_of_a_script_ends_by_a_signal(tmp_path, number):

@@ -252,7 +252,7 @@ def test_no_other_option_makes_an_emulated_machine_of_a_named_bus(monkeypatch):
     assert not found, "\n".join(found)
 
 
-def test_what_only_a_bus_has_is_never_an_emulated_machines(monkeypatch):
+def test_what_only_a_bus_has_is_never_an_emulated_machines(files_read_here, monkeypatch):
     rows = [
         (command, line(command, *named), (2,), f"{NO_CHANNEL}|{named[0]} is for a bus; give its --channel")
         for command in ON_A_BUS

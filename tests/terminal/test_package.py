@@ -53,7 +53,7 @@ def test_the_version_has_one_home_and_its_heading_in_the_changelog():
     assert cited and cited[1] == drive_env.__version__
 
 
-@pytest.mark.every(9)
+@pytest.mark.every(18)
 @pytest.mark.parametrize(("missing", "arguments", "extra"), [
     (OF_AGENTS, ("drive-agent", "train"), "agents"),
     (OF_AGENTS, ("drive-agent", "train", "tracking", "--algorithm", "sac"), "agents"),

@@ -91,7 +91,7 @@ def run(program, *arguments, **environment):
     )  # fmt: skip
 
 
-@pytest.mark.every(2)
+@pytest.mark.every(4)
 @pytest.mark.parametrize(("program", "begun", "commands"), [
     ("drive-env", "sc", {"scan", "scope"}),
     ("drive-env", "parameters ", {"backup", "diff", "restore", "commission"}),

@@ -125,7 +125,7 @@ def channel():
 
 
 @pytest.mark.parametrize(("command", "code"), [
-    (("scan", "--last", "2", "--timeout", "3"), 0),
+    (("scan", "--last", "2", "--timeout", "1"), 0),
     (("monitor", "-n", "1", "-n", "2", "--duration", "0.01"), 0),
     (("parameters", "commission", "ec_45_flat", "--dry-run"), 0),
     (("parameters", "diff", "some_parameters_of_a_drive_whose_name_is_long.toml"), 1),

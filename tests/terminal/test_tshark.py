@@ -110,6 +110,7 @@ def test_it_would_be_found(conversation, tmp_path):
     assert len(found) == 1
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("ending", [".log", ".pcap", ".pcapng"])
 def test_a_remote_frame_has_the_length_that_is_shown_for_it(ending, tmp_path, capsys):
     frame = can.Message(arbitration_id=0x705, is_remote_frame=True, dlc=3, is_extended_id=False)

@@ -121,7 +121,7 @@ PAIRS = [
 ]  # fmt: skip
 
 
-@pytest.mark.every(4)
+@pytest.mark.every(12)
 @pytest.mark.parametrize(("device", "load", "parameters", "better", "worse", "reason"), PAIRS)
 def test_the_better_tuning_costs_less(device, load, parameters, better, worse, reason):
     found = scores_of(device, load, parameters, [better, worse])

@@ -136,6 +136,7 @@ def test_the_fit_finds_the_machine(log):
     assert all(np.array_equal(values, before[name]) for name, values in drives.machine.parameters.items())
 
 
+@pytest.mark.slow
 def test_the_fitted_set_draws_machines_like_the_real_one(log, tmp_path):
     found = fit(machines(32), log, "two_mass", list(TRUTH), rounds=5)
     path = tmp_path / "fitted.toml"
@@ -151,6 +152,7 @@ def test_the_fitted_set_draws_machines_like_the_real_one(log, tmp_path):
         assert max(values) <= found.accepted[name].max()
 
 
+@pytest.mark.slow
 def test_a_parameter_that_the_log_does_not_show_keeps_its_law(log):
     found = fit(machines(64), log, "two_mass", ["load.inertia", "motor.thermal_resistance"], slack=1.5)
     assert found.narrowed["motor.thermal_resistance"] > 0.5

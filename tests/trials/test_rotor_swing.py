@@ -56,6 +56,7 @@ def swings(motor, inertia, friction, detent, at):
     return np.array(rows) / motor.n_p
 
 
+@pytest.mark.every(5)
 @pytest.mark.parametrize("rotors", [1.2, 4.0, 20.0])
 @pytest.mark.parametrize("phase", [0.0, math.pi / 8.0])
 def test_detent_torque_cancels_between_two_places_wherever_full_steps_are(rotors, phase):
@@ -153,6 +154,7 @@ def test_an_error_is_the_variance_about_its_mean():
     np.testing.assert_allclose(errors[0, 1::3], np.var(wave[1:]), rtol=1e-9)
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("rotors", [6.0, 40.0, 250.0])
 def test_the_frequency_is_found_between_the_lines_of_its_grid(rotors):
     inertia = rotors * MOTOR.inertia

@@ -517,7 +517,7 @@ def test_on_the_public_machines_it_comes_near_the_best_that_margins_allow_and_st
 
 
 def test_brief_identification_is_right_and_quick():
-    with emulated(load="two_mass", num_machines=2, num_threads=2) as target:
+    with emulated(load="two_mass", num_threads=1) as target:
         found = identify_briefly(target)
         true = true_plant(target.drives)
     for one in found:

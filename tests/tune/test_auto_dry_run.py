@@ -69,7 +69,7 @@ def dry_run(channel, *more):
     return result
 
 
-@pytest.mark.every(2)
+@pytest.mark.every(4)
 @pytest.mark.parametrize("by", ["design", "agent", "rule", "tpe"])
 def test_the_drive_is_read_and_nothing_else(by):
     with served() as (world, _, channel, frames):
@@ -133,7 +133,7 @@ def turn(drives):
     drives.write(0x6040, 0)  # and it coasts
 
 
-@pytest.mark.every(2)
+@pytest.mark.every(6)
 @pytest.mark.parametrize(
     ("prepare", "line"),
     [
@@ -158,6 +158,7 @@ def test_what_a_run_would_not_begin_for(prepare, line):
     assert found.stderr.startswith("drive-tune: a run would not start")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("patient_masters", [None], ids=["as patient as a user's"])
 def test_a_node_that_is_stopped_stays_so(patient_masters):
     with served() as (world, _, channel, frames):

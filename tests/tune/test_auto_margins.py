@@ -101,6 +101,7 @@ def test_a_measured_velocity_loop_tells_the_margins_of_both_loops_with_any_gains
             assert found.gain_db == pytest.approx(true.gain_db, abs=2.0), name
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize("gains", [GAINS, *OTHERS])
 @pytest.mark.parametrize("loop", ["velocity", "position"])
 def test_what_margins_are_at_least_is_less_than_what_they_are_and_not_by_much(measured, gains, loop):

@@ -61,7 +61,7 @@ def on_drawn_machines(device, motor, load="inertia", count=6, velocity_filter=SH
     return Found(*margins, clearance, overshoot, slack)
 
 
-@pytest.mark.every(16)
+@pytest.mark.every(48)
 @pytest.mark.parametrize("velocity_filter", [SHIPPED, 150.0, 800.0])
 @pytest.mark.parametrize(("device", "motor"), ON_ALL)
 def test_on_drawn_rigid_machines_the_rule_keeps_standard_dynamics(device, motor, velocity_filter):

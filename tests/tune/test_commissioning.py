@@ -77,6 +77,7 @@ def without(*names):
 
 
 # --- a stop ---------------------------------------------------------------------------------------------------------
+@pytest.mark.every(3)
 @pytest.mark.parametrize("step", CHEAP)
 def test_stopped_in_any_step_the_drive_is_as_it_was_found(fresh, tmp_path, step):
     """By Ctrl-C, as soon as the step says that it is under way, or once it is done."""

@@ -23,7 +23,7 @@ STEPPERS = [name for name in MOTORS if name.startswith("qsh")]
 LOOP = tuple(find_device("tmcm3313").gains.loop_of_kind(LOAD_ANGLE).gains)
 
 
-@pytest.mark.every(6)
+@pytest.mark.every(18)
 @pytest.mark.parametrize(
     ("motor", "device", "gains"),
     [(motor, *row) for motor in STEPPERS for row in (("tmcm6212", ()), ("tmcm3313", ()), ("tmcm3313", LOOP))],

@@ -125,7 +125,7 @@ def told_and_inside(target, axes, names):
     return {name: tuple(map(int, row)) for name, row in counts.items()}
 
 
-@pytest.mark.every(2)
+@pytest.mark.slow
 @pytest.mark.parametrize(("load", "seed", "least"), [("vertical_screw", 3, 3), ("ball_screw", 2, 4)])
 def test_what_a_screw_loses_is_no_inertia_of_its_load(monkeypatch, load, seed, least):
     """Of four machines: a loss is not taken for inertia, nor what repeats on a short way for a load that changes."""
@@ -360,6 +360,7 @@ def test_too_little_current_is_too_weak():
     assert "current is too low" in found.estimates["resistance"].reason
 
 
+@pytest.mark.slow
 def test_a_rigid_axis_has_no_resonance():
     found = identify(emulated(load="inertia", num_threads=1))[0]
     assert not found.estimates["resonance"].is_known

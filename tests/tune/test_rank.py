@@ -279,7 +279,7 @@ def test_on_processes_it_is_the_same_comparison(tmp_path):
 
 
 # --- machines of several axes -------------------------------------------------------------------------------------
-@pytest.mark.every(4)
+@pytest.mark.every(8)
 @pytest.mark.parametrize("load", ["gantry", pytest.param("robot", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     "name", ["factory", "baseline", "simc", pytest.param("auto", marks=pytest.mark.slow), "random", "tpe-safe"]

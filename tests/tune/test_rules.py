@@ -158,7 +158,7 @@ def test_the_symmetrical_optimum_of_the_sampled_drive_has_its_textbook_margin():
 
 
 # --- every rule -------------------------------------------------------------------------------------------------------
-@pytest.mark.every(4)
+@pytest.mark.every(12)
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("motor", ["qbl4208", "ec_i_40", "class_750w", "qube_servo_3"])
 def test_every_rule_proposes_integers_that_are_stable_in_every_loop(rule, motor):
@@ -195,6 +195,7 @@ def test_rules_are_known_by_name_and_each_has_a_meaning():
 
 
 # --- margin targets ---------------------------------------------------------------------------------------------------
+@pytest.mark.every(3)
 @pytest.mark.parametrize("name", TARGETS)
 @pytest.mark.parametrize("axis", [plant(), plant(anti_resonance=60.0, resonance=110.0)], ids=["rigid", "elastic"])
 def test_margin_targets_are_kept_and_the_next_integers_would_break_them(name, axis):

@@ -43,6 +43,7 @@ from tuning.runs.unfinished import shard_log
 from tuning.search import searches
 from tuning.search.optimise import Settings
 
+pytestmark = pytest.mark.usefixtures("files_read_here")
 MOTOR = (motors.FOLDER / "qbl4208.toml").read_text(encoding="utf-8")
 RESISTANCE = re.compile(r"(resistance_\w+ = \[)([0-9.]+)")
 INVENTED = TESTS / "invented_drive"

@@ -34,6 +34,7 @@ def search(proposer, trials, generation, journal_breaks_at=None):
     return np.array(points)
 
 
+@pytest.mark.every(3)
 @pytest.mark.parametrize(("sampler", "generation"), [("tpe", 1), ("tpe", 8), ("cmaes", 1), ("cmaes", 8)])
 def test_a_search_gets_to_the_bottom(sampler, generation):
     points = search(new_proposer(sampler, LOW, HIGH, seed=1, generation=generation), 64, generation)

@@ -355,6 +355,7 @@ def bare_cluster():
         yield cluster
 
 
+@pytest.mark.slow
 def test_a_worker_without_the_package_is_told_before_and_when_it_joins_late(bare_cluster):
     told = (
         r" of the cluster at tcp://.* cannot run this: .*tuning.*; install drive-env where it runs, and continue with"
@@ -390,6 +391,7 @@ def test_a_worker_of_a_cluster_that_gives_back_what_is_no_result_is_refused_by_i
             in_order(pool, abs, [-3])
 
 
+@pytest.mark.slow
 def test_a_worker_of_another_numpy_that_is_not_there_at_first_is_named_once(caplog):
     lie = "provenance.versions = lambda: versions() | {'numpy': '0.9'}"
     with cluster_with(LYING_WORKER.format(lie=lie)) as cluster, open_pool(cluster=cluster.scheduler_address) as pool:

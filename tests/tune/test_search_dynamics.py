@@ -34,7 +34,7 @@ def drive_tune(*arguments):
     return CliRunner().invoke(app, list(map(str, arguments)))
 
 
-@pytest.mark.every(2)
+@pytest.mark.every(4)
 @pytest.mark.parametrize("load", ["inertia", "two_mass"])
 @pytest.mark.parametrize("safe", [False, True])
 def test_what_breaks_margins_by_the_true_machine_never_reaches_a_drive(load, safe, monkeypatch):
@@ -80,6 +80,7 @@ def test_proposals_that_break_the_dynamics_are_no_trials():
     assert found.gains[0].tolist() == best.gains[0].tolist() and found.cost[0] == best.cost
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize(
     ("safe", "says"), [(False, "0 trials: 160 proposals broke"), (True, "no slow gains keep 89.9/39.9/1.0001")]
 )

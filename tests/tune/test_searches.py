@@ -74,7 +74,7 @@ class KilledError(Exception):
     """Raised in place of a kill."""
 
 
-@pytest.mark.every(6)
+@pytest.mark.every(12)
 @pytest.mark.parametrize("sampler", ["random", "tpe", "cmaes", "grid"])
 @pytest.mark.parametrize("safe", [False, True])
 def test_a_search_that_was_killed_goes_on_from_its_last_generation(tmp_path, monkeypatch, sampler, safe):

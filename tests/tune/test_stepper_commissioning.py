@@ -120,6 +120,7 @@ def test_a_load_that_is_acceptable_does_not_stop_it_and_an_obstacle_does(stepper
         assert not prove_with_load(found, moves, SPEED, run, np.ones(1, bool)).stopped.any()
 
 
+@pytest.mark.every(2)
 @pytest.mark.parametrize("at", [0.05, 0.6])
 def test_an_emergency_in_the_moves_is_named(stepper, at):
     """It said "it lost steps at 14.4 rad/s with its run current"."""

@@ -162,7 +162,7 @@ def test_a_bus_that_is_gone_is_told(tmp_path):
 @contextmanager
 def nmt(bus):
     """Another master on the bus: sends NMT commands to node 1, and asks for its state by guarding."""
-    with can.Bus(interface="slcan", channel=bus[3]) as other:
+    with can.Bus(interface="slcan", channel=bus[3], sleep_after_open=0) as other:
 
         def send(command):
             other.send(can.Message(arbitration_id=0, data=[command, 1], is_extended_id=False))

@@ -133,6 +133,7 @@ def test_wiring_is_drawn_with_the_rest_where_nobody_takes_it_for_granted(commiss
 
 
 # --- the maker's programs ---------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_the_settings_of_the_maker_s_demonstration_programs_turn_the_default_served_drive():
     """They write 2080h:01 = 1 and 2070h:01 = 1, then turn by the encoder, and by the halls."""
     with served("calls", load="inertia") as drives:
