@@ -46,9 +46,14 @@ def imitate(
         rounds: Rounds of acting and learning: the teacher acts in the first, the student in the last, in those between
             either in some of the environments. The critic learns from the latest round alone.
         told: Called with the finished share, 0...1.
+
+    Raises:
+        ValueError: Without an update or a round.
     """
     import torch
 
+    if min(updates, rounds) < 1:
+        raise ValueError(f"an imitation has 1 or more updates and rounds, not {updates} and {rounds}")
     env, policy = model.get_env(), model.policy
     lesson = _Lesson(model, teacher, seed)
     learning = getattr(policy, "actor", policy)

@@ -397,6 +397,7 @@ def test_hyperparameters_that_the_algorithm_does_not_take_are_told(tmp_path):
         ({"normalize": {"norm_foo": 1}}, "normalize does not take these hyper-parameters: .*'norm_foo'"),
         ({"vec_env_wrapper": {"agents.training.rewards:SmallErrors": {"foo": 1}}}, "SmallErrors does not take .*'foo'"),
         ({"imitate": {"nothing": {"stepz": 1}}}, "imitate nothing does not take these hyper-parameters: .*'stepz'"),
+        ({"imitate": {"nothing": {"rounds": 0}}}, "an imitation has 1 or more updates and rounds, not 1200 and 0"),
         (
             {"policy": "agents.training.asymmetric:AsymmetricPolicy"},
             "needs an observation with 'observation' first .*MlpPolicy",
