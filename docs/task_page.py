@@ -60,9 +60,9 @@ loses its steps with the expert, every fourth with an agent, since near the high
 LACKS = {
     "TorqueTracking-v1": "the expert knows each machine's inertia and friction, of which an agent sees what the first "
     "moves of its second show; with nominal parameters the expert has far less than an agent.",
-    "Crane-v1": "the expert knows the rope, of which an agent sees angle and rate of the moment alone. What it is taught "
-    "is one answer for all ropes, better than the nominal rope's; exploration adds little, since an action changes a "
-    "speed by little and the reward is flat until the load is within some centimetres of its path.",
+    "Crane-v1": "the expert knows the rope, of which an agent sees angle and rate of the moment alone. What it is "
+    "taught is one answer for all ropes, better than the nominal rope's; exploration adds little, since an action "
+    "changes a speed by little and the reward is flat until the load is within some centimetres of its path.",
     "PoleBalance-v1": "as Crane-v1, of the pole's length.",
     "PoleSwingUp-v1": "as PoleBalance-v1.",
     "PayloadScheduling-v1": "the expert knows the payload, which an agent sees in currents and errors alone.",
