@@ -60,11 +60,11 @@ loses its steps with the expert, every fourth with an agent, since near the high
 LACKS = {
     "TorqueTracking-v1": "the expert knows each machine's inertia and friction, of which an agent sees what the first "
     "moves of its second show; with nominal parameters the expert has far less than an agent.",
-    "Crane-v1": "the reward is flat until the load is within some centimetres of its path, and an action changes a "
-    "speed by little, so that exploration finds next to nothing. What agents can is what is left of the expert that "
-    "they begin as, which knows the rope and the mass.",
-    "PoleBalance-v1": "as Crane-v1; a fall ends the episode besides.",
-    "PoleSwingUp-v1": "as PoleBalance-v1, after a swing-up that earns hardly anything before it succeeds.",
+    "Crane-v1": "the expert knows the rope, of which an agent sees angle and rate of the moment alone. What it is "
+    "taught is one answer for all ropes, better than the nominal rope's; exploration adds little, since an action "
+    "changes a speed by little and the reward is flat until the load is within some centimetres of its path.",
+    "PoleBalance-v1": "as Crane-v1, of the pole's length.",
+    "PoleSwingUp-v1": "as PoleBalance-v1.",
     "PayloadScheduling-v1": "the expert knows the payload, which an agent sees in currents and errors alone.",
     "KnownPayload-v1": "the expert's schedule is near the least lag that the margins allow.",
     "ServoTuning-v1": "the expert computes the margins of each machine's true model; an agent has ten trials of it, "
@@ -194,7 +194,7 @@ def measure(folder: Path, scores: dict[str, dict[str, Any]]) -> None:
     rows = [row for row in json.loads((folder / "results.json").read_text(encoding="utf-8")) if row["task"] in TASKS]
     for name in dict.fromkeys(row["task"] for row in rows):
         unlearnt = {policy: round(score, 4) for policy, score in unlearnt_scores(name, MACHINES).items()}
-        scores[name] = {"trained": {}, **scores.get(name, {}), "unlearnt": unlearnt, "baselines": {}}
+        scores[name] = {"trained": {}, "baselines": {}, **scores.get(name, {}), "unlearnt": unlearnt}
         curves = folder / name.partition("/")[2] / "learning_curves.png"
         if curves.is_file():
             with Image.open(curves) as picture:

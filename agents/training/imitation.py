@@ -1,8 +1,10 @@
 """Imitation of a teacher: before an algorithm improves a policy, its network learns the teacher's actions.
 
-The teacher acts with the algorithm's initial exploration noise, so that the critic learns the returns of noisy actions,
-too: the first updates by an untrained critic would undo the imitation. What it has seen stays in the replay buffer of
-an algorithm that has one, and its critic learns from there. A recurrent network learns from windows of an episode.
+The teacher acts first, then the student in more and more environments, and the teacher tells what it would do: how to
+make up for its own errors a student learns only where they lead (DAgger, Ross et al. 2011). Both act with the
+algorithm's initial exploration noise, so that the critic learns the returns of noisy actions, too: the first updates by
+an untrained critic would undo the imitation. What was done stays in the replay buffer of an algorithm that has one, and
+its critic learns from there. A recurrent network learns from windows of an episode.
 """
 
 from __future__ import annotations
@@ -28,6 +30,7 @@ def imitate(
     seed: int,
     steps: int = STEPS,
     updates: int = UPDATES,
+    rounds: int = 1,
     told: Callable[[float], None] = lambda share: None,
 ) -> float:
     """Teach a model and return the RMS difference of its actions from the teacher's in the last update.
@@ -40,45 +43,127 @@ def imitate(
         seed: Seed of the environments and of the noise.
         steps: Steps of all environments together.
         updates: Updates of the network; of SAC, TQC and CrossQ as many of the actor and of the critic.
+        rounds: Rounds of acting and learning: the teacher acts in the first, the student in the last, in those between
+            either in some of the environments. The critic learns from the latest round alone.
         told: Called with the finished share, 0...1.
+
+    Raises:
+        ValueError: Without an update or a round.
     """
     import torch
 
+    if min(updates, rounds) < 1:
+        raise ValueError(f"an imitation has 1 or more updates and rounds, not {updates} and {rounds}")
     env, policy = model.get_env(), model.policy
-    rng = np.random.default_rng(seed)
-    env.seed(seed)
-    rows, actions, rewards, ends = _play(model, teacher, rng, _deviation(policy), max(1, steps // env.num_envs), told)
-    scale = np.sqrt(env.ret_rms.var + env.epsilon) if getattr(env, "norm_reward", False) else 1.0
-    returns = _discounted(rewards / scale, ends, float(model.gamma))
-    normalised = env.normalize_obs(rows) if hasattr(env, "normalize_obs") else rows
-
-    def tensor(columns: NDArray[Any]) -> Any:
-        return torch.as_tensor(columns.reshape(-1, columns.shape[-1]), dtype=torch.float32)
-
-    inputs, wanted = _each(normalised, tensor), tensor(actions)
-    values = torch.as_tensor(returns.reshape(-1), dtype=torch.float32)
-    first_episodes = np.where(ends.any(axis=0), ends.argmax(axis=0) + 1, len(ends))
-    length = min(WINDOW, int(first_episodes.max())) if hasattr(policy, "lstm_actor") else 1
-    first, ahead = _windows(ends, length), env.num_envs * np.arange(length)
-    policy.set_training_mode(True)
+    lesson = _Lesson(model, teacher, seed)
     learning = getattr(policy, "actor", policy)
     parameters = [value for name, value in learning.named_parameters() if name != "log_std"]
     optimiser = torch.optim.Adam(parameters, lr=LEARNING_RATE)
     falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, updates)
-    for _ in range(updates):
-        begins = first[rng.integers(0, len(first), BATCH // length)]
-        chosen = torch.from_numpy((begins[:, None] + ahead).ravel())
-        found, judged = _answers(policy, _each(inputs, lambda rows: rows[chosen]), len(begins))  # noqa: B023
-        error = (found - wanted[chosen]).square().mean()
-        loss = error if judged is None else error + 0.5 * (judged.flatten() - values[chosen]).square().mean()
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-        falling.step()
+    each = max(1, steps // env.num_envs // rounds)
+    for turn in range(rounds):
+        latest = len(lesson.ends) * env.num_envs
+        for step in range(each):
+            told((turn + PLAYING * step / each) / rounds)
+            lesson.play(turn / max(rounds - 1, 1))
+        draw = lesson.windows()
+        policy.set_training_mode(True)
+        for _ in range(updates * turn // rounds, updates * (turn + 1) // rounds):
+            chosen, inputs, wanted, values, windows = draw()
+            found, judged = _answers(policy, inputs, windows)
+            error = loss = (found - wanted).square().mean()
+            if judged is not None:
+                loss = error + 0.5 * ((judged.flatten() - values).square() * (chosen >= latest)).mean()
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+            falling.step()
     if hasattr(model, "replay_buffer"):
         _teach_critic(model, updates)
     told(1.0)
     return float(error.detach().sqrt())
+
+
+class _Lesson:
+    """What was seen and earned, and what the teacher would have done, of shape (environments, ...) in each step.
+
+    Args:
+        model, teacher, seed: As for `imitate`.
+    """
+
+    def __init__(self, model: Any, teacher: Any, seed: int) -> None:
+        self.model, self.teacher, self.env, self.rng = model, teacher, model.get_env(), np.random.default_rng(seed)
+        self.deviation = _deviation(model.policy)
+        self.changes = hasattr(self.env.get_attr("config")[0], "payload")  # machines within an episode
+        self.rows: list[Any] = []
+        self.wanted: list[Any] = []
+        self.rewards: list[Any] = []
+        self.ends: list[Any] = []
+        self.env.seed(seed)
+        self.seen, self.memory, self.begun = self.env.reset(), None, np.ones(self.env.num_envs, bool)
+        teacher.reset(None)
+        _tell(teacher, self.env, self.begun)
+
+    def play(self, share: float) -> None:
+        """Make a step, in which the student acts in a share of the environments, 0...1.
+
+        A model with a replay buffer keeps what was done.
+        """
+        env, model = self.env, self.model
+        rows = _each(env.get_original_obs() if hasattr(env, "get_original_obs") else self.seen, np.array)
+        wanted = np.asarray(self.teacher.act(rows[ACTOR] if isinstance(rows, dict) else rows), np.float32)
+        done = wanted + self.deviation * self.rng.standard_normal(wanted.shape)
+        if share:
+            own, self.memory = model.predict(self.seen, self.memory, self.begun, deterministic=True)
+            student = np.arange(env.num_envs) < share * env.num_envs
+            done[student] += (own - wanted)[student]
+        done = np.clip(done, model.action_space.low, model.action_space.high).astype(np.float32)
+        model._last_obs, model._last_original_obs = self.seen, rows
+        self.seen, reward, ended, infos = env.step(done)
+        if hasattr(model, "replay_buffer"):
+            scaled = model.policy.scale_action(done)
+            model._store_transition(model.replay_buffer, scaled, self.seen, reward, ended, infos)
+        reward = env.get_original_reward() if hasattr(env, "get_original_reward") else reward
+        if ended.any():
+            self.teacher.reset(ended)
+        if self.changes or ended.any():
+            _tell(self.teacher, env, ended | self.changes)
+        self.begun = ended
+        columns = (self.rows, self.wanted, self.rewards, self.ends)
+        for column, value in zip(columns, (rows, wanted, reward, ended), strict=True):
+            column.append(_each(value, np.array))
+
+    def windows(self) -> Callable[[], tuple[Any, ...]]:
+        """Return a function that draws windows.
+
+        It returns flat indices, observations, the teacher's actions, returns, and how many windows they are.
+        """
+        import torch
+
+        env, ends = self.env, np.stack(self.ends)
+
+        def tensor(columns: NDArray[Any]) -> Any:
+            return torch.as_tensor(columns.reshape(-1, columns.shape[-1]), dtype=torch.float32)
+
+        if isinstance(self.rows[0], dict):
+            rows: Any = {key: np.stack([one[key] for one in self.rows]) for key in self.rows[0]}
+        else:
+            rows = np.stack(self.rows)
+        inputs = _each(env.normalize_obs(rows) if hasattr(env, "normalize_obs") else rows, tensor)
+        wanted = tensor(np.stack(self.wanted))
+        scale = np.sqrt(env.ret_rms.var + env.epsilon) if getattr(env, "norm_reward", False) else 1.0
+        returns = _discounted(np.stack(self.rewards) / scale, ends, float(self.model.gamma))
+        values = torch.as_tensor(returns.reshape(-1), dtype=torch.float32)
+        first_episodes = np.where(ends.any(axis=0), ends.argmax(axis=0) + 1, len(ends))
+        length = min(WINDOW, int(first_episodes.max())) if hasattr(self.model.policy, "lstm_actor") else 1
+        first, ahead = _windows(ends, length), env.num_envs * np.arange(length)
+
+        def draw() -> tuple[Any, ...]:
+            begins = first[self.rng.integers(0, len(first), BATCH // length)]
+            chosen = torch.from_numpy((begins[:, None] + ahead).ravel())
+            return chosen, _each(inputs, lambda rows: rows[chosen]), wanted[chosen], values[chosen], len(begins)
+
+        return draw
 
 
 def _deviation(policy: Any) -> Any:
@@ -141,46 +226,6 @@ def _each(observations: Any, function: Callable[[Any], Any]) -> Any:
     if isinstance(observations, dict):
         return {key: function(rows) for key, rows in observations.items()}
     return function(observations)
-
-
-def _play(
-    model: Any, teacher: Any, rng: np.random.Generator, deviation: Any, steps: int, told: Callable[[float], None]
-) -> tuple[Any, NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """Return observations, the teacher's actions, rewards and ends, each of shape (steps, environments, ...).
-
-    A model with a replay buffer keeps what was done.
-    """
-    env, low, high = model.get_env(), model.action_space.low, model.action_space.high
-    changes = hasattr(env.get_attr("config")[0], "payload")  # machines within an episode
-    seen = env.reset()
-    teacher.reset(None)
-    _tell(teacher, env, np.ones(env.num_envs, bool))
-    observations: list[Any] = []
-    found: tuple[list[Any], ...] = ([], [], [])
-    for step in range(steps):
-        told(PLAYING * step / steps)
-        rows = _each(env.get_original_obs() if hasattr(env, "get_original_obs") else seen, np.array)
-        wanted = np.asarray(teacher.act(rows[ACTOR] if isinstance(rows, dict) else rows), np.float32)
-        noise = deviation * rng.standard_normal(wanted.shape)
-        done = np.clip(wanted + noise, low, high).astype(np.float32)
-        model._last_obs, model._last_original_obs = seen, rows
-        seen, reward, ended, infos = env.step(done)
-        if hasattr(model, "replay_buffer"):
-            model._store_transition(model.replay_buffer, model.policy.scale_action(done), seen, reward, ended, infos)
-        reward = env.get_original_reward() if hasattr(env, "get_original_reward") else reward
-        if ended.any():
-            teacher.reset(ended)
-        if changes or ended.any():
-            _tell(teacher, env, ended | changes)
-        observations.append(rows)
-        for column, value in zip(found, (wanted, reward, ended), strict=True):
-            column.append(np.array(value))
-    if isinstance(observations[0], dict):
-        stacked: Any = {key: np.stack([rows[key] for rows in observations]) for key in observations[0]}
-    else:
-        stacked = np.stack(observations)
-    actions, rewards, ends = (np.stack(column) for column in found)
-    return stacked, actions, rewards, ends
 
 
 def _tell(teacher: Any, env: Any, mask: Any) -> None:

@@ -28,6 +28,7 @@ from agents.training import train as training
 from agents.training.algorithms import ALGORITHMS
 from agents.training.hyperparameters import HyperparameterError, read_value
 from agents.training.imitation import _windows, imitate
+from agents.training.rewards import LAST_ACTION
 from agents.training.train import DivergedError, train
 from agents.training.training_run import AGENT, CHECKPOINT, TABLE, TrainingRun
 from tuning.runs import provenance
@@ -209,6 +210,20 @@ def test_every_algorithm_imitates_and_a_replay_buffer_has_what_the_teacher_saw(a
     assert judged == pytest.approx(buffer.rewards.mean() / (1.0 - model.gamma), rel=0.25)
 
 
+@pytest.mark.parametrize("algorithm", ["ppo", "crossq", "recurrent_ppo"])
+def test_the_student_acts_in_more_and_more_environments_while_it_is_taught(algorithm):
+    """The last action is an entry of the observation: the teacher's is always 1, an untaught student's about 0."""
+    lanes, env = training.make_env(tiny(algorithm=algorithm, env_kwargs={"duration": 1.0}))
+    model, _ = training.make_model(tiny(algorithm=algorithm, policy_kwargs={"log_std_init": -9.0}), env)
+    teacher = Constant(np.float32([1.0]))
+    seen, act = [], teacher.act
+    teacher.act = lambda rows: seen.append(rows[:, LAST_ACTION]) or act(rows)
+    imitate(model, teacher, seed=1, steps=3 * 4 * 10, updates=3, rounds=3)
+    lanes.close()
+    by_teacher = np.array(seen)[[9, 15, 29]] > 0.9  # of one round each; an action is seen in the next step
+    assert by_teacher.tolist() == [[True] * 4, [False, False, True, True], [False] * 4]
+
+
 @pytest.mark.parametrize("length", [1, 3])
 def test_windows_of_an_imitation_lie_within_an_episode(length):
     ends = np.zeros((8, 2), bool)
@@ -382,6 +397,7 @@ def test_hyperparameters_that_the_algorithm_does_not_take_are_told(tmp_path):
         ({"normalize": {"norm_foo": 1}}, "normalize does not take these hyper-parameters: .*'norm_foo'"),
         ({"vec_env_wrapper": {"agents.training.rewards:SmallErrors": {"foo": 1}}}, "SmallErrors does not take .*'foo'"),
         ({"imitate": {"nothing": {"stepz": 1}}}, "imitate nothing does not take these hyper-parameters: .*'stepz'"),
+        ({"imitate": {"nothing": {"rounds": 0}}}, "an imitation has 1 or more updates and rounds, not 1200 and 0"),
         (
             {"policy": "agents.training.asymmetric:AsymmetricPolicy"},
             "needs an observation with 'observation' first .*MlpPolicy",
