@@ -113,10 +113,12 @@ class Trials(Saved):
         look: If not None, called after every cycle.
         computes_demand: Whether a demand that the drives cannot send is replaced by that of the profile.
         returns: Whether a trial ends where it began; otherwise it ends where its move did.
+        longer: Cycles that each motion lasts beyond `TRIAL`, a whole number of windows: slow loops arrive later.
     """
 
     computes_demand = True
     returns = False
+    longer = 0
 
     def __init__(self, drives: Drives, motor: Motor, axes: int, t_0: float) -> None:
         self.look: Callable[[], None] | None = None
@@ -178,7 +180,8 @@ class Trials(Saved):
         aborted = np.zeros(shape, bool)
         stopped, culprit = np.zeros((2, count), bool)
         settling, noise, overshoot, following = (np.zeros(shape) for _ in range(4))
-        first_error = np.zeros((TRIAL, count))
+        cycles = TRIAL + self.longer
+        first_error = np.zeros((cycles, count))
         write_profile(drives, move, where)
         phases = ((away, gains), (origin, gains), (away, device_of(drives).gains.with_velocity_p(gains, PROBE)))
         for phase, (target, tried) in enumerate(phases):
@@ -193,7 +196,7 @@ class Trials(Saved):
             )
             size = np.maximum(np.abs(move.distance), 1)
             if demand is None:
-                demand = computed(away if back else origin, target, move, TRIAL)
+                demand = computed(away if back else origin, target, move, cycles)
             error = wrapped(demand - position) / size
             following[phase] = np.maximum(np.abs(error).sum(axis=0), 0.5) * CYCLE
             if phase == 0:
@@ -242,7 +245,7 @@ class Trials(Saved):
         culprit = np.zeros(len(stopped), bool)
         self._prepare(objects)
         start(drives, to, where)
-        for _ in range(TRIAL // WATCH):
+        for _ in range((TRIAL + self.longer) // WATCH):
             with warnings.catch_warnings():
                 warnings.filterwarnings("ignore", "machine .* left the range of physics", RuntimeWarning)
                 trace = self._record(objects, WATCH)

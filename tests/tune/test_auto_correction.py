@@ -15,15 +15,18 @@ from drive_env.drives.raw_gains import write_gains
 from drive_env.loops.dynamics import find_dynamics
 from drive_env.loops.sampled import CascadeGains, LoopRates, closed_loops, step_overshoot, window
 from drive_env.loops.true_plant import true_machines
+from drive_env.loops.worst_margins import worst_margins
 from drive_env.safety.envelope import SafetyError
 from tuning.auto import correction, design
 from tuning.auto.bench import Journal
 from tuning.auto.correction import CORRECTIONS, LOWERED, _lowered, _most_velocity_p, _short, correct
 from tuning.auto.identified import calm_gains
+from tuning.auto.one_button import auto
 from tuning.auto.proving import RESTLESS, Proof, ProvingGround
 from tuning.auto.stages import RecordedGains
 from tuning.auto.twin import Known
 from tuning.certificate.certificate import TAKEN, Correction
+from tuning.compare.suite import load_suite, open_group
 from tuning.target import emulated
 
 DEVICE, STANDARD = find_device("tmcm1636"), find_dynamics("standard")
@@ -392,6 +395,61 @@ def test_a_step_on_the_drive_overshoots_as_the_linear_machine_does(position):
         expected = step_overshoot(rates, closed_loops(rates, machines, one, window(rates, machines, one)))[0]
         assert found == pytest.approx(expected, abs=0.04)
         assert target.drives.read(0x6061).tolist() == [1], "and it is back in pp"
+
+
+# --- slow loops -------------------------------------------------------------------------------------------------------
+SOFT = {  # two soft shafts of the suite, and gains that keep the constraints on them
+    "two_mass-qbl4208-2": [2274, 1534, 220, 304, 54],
+    "two_mass-ec_i_40-3": [597, 3782, 161, 129, 24],
+}
+
+
+def on_soft_shaft(name):
+    """Return the machine as a target, and its ground: dry friction of 60 and 110 mA is known."""
+    target = open_group([machine for machine in load_suite("public") if machine.name == name], 1)
+    plant = true_plant(target.drives)
+    safe = np.stack([calm_gains(target, plant)])
+    return target, ProvingGround(
+        target, [plant], (target.low, target.high), safe, safe, (0.0, 0.06 if "qbl" in name else 0.11)
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SOFT)
+def test_slow_loops_get_the_time_and_the_step_that_they_need(name):
+    """Loops below 3 Hz, and friction as large as the current of 50 counts: these counts overshot by 54 and 136 %."""
+    target, ground = on_soft_shaft(name)
+    gains = np.array([SOFT[name]])
+    with target.drives:
+        machines, rates = true_machines(target.drives), LoopRates.of(DEVICE)
+        one = CascadeGains.of(DEVICE, gains[None])
+        expected = step_overshoot(rates, closed_loops(rates, machines, one, window(rates, machines, one)))[0]
+        assert ground.run(gains, np.ones(1, bool)).reason == ("",)
+        assert ground.step(gains, np.ones(1, bool)) == pytest.approx(expected, abs=0.15)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SOFT)
+def test_soft_shafts_whose_oracle_keeps_the_constraints_are_accepted_with_true_margins(name, tmp_path):
+    target, _ = on_soft_shaft(name)
+    with target.drives:
+        axis = auto(target, tmp_path / "before.toml", keep=False).axes[0]
+        assert axis.accepted, axis.reason
+        found = CascadeGains.of(DEVICE, np.array([[axis.after]]))
+        true = worst_margins(LoopRates.of(DEVICE), true_machines(target.drives), found)
+        assert true.phase_deg >= 40.0 and true.gain_db >= 7.0 and true.ms <= 2.1
+        assert target.drives.read(0x6061).tolist() == [1]
+
+
+def test_loops_that_are_fast_enough_get_no_more_time_and_no_larger_step():
+    with emulated(load="inertia", num_threads=1) as target:
+        plant = true_plant(target.drives)
+        rule = rule_gains(target.device, target.motor, plant.inertia, supply=plant.supply)
+        ground = ProvingGround(target, [plant], (target.low, target.high), rule, rule, (0.0, 0.06))
+        assert ground._longer(rule, np.ones(1, bool)) == 0 and ground._step_size(rule) == [50 * 16]
+        slow = rule // 12
+        assert ground._longer(slow, np.ones(1, bool)) > 100 and ground._step_size(slow) > 50 * 16
+        assert ground._longer(slow, np.zeros(1, bool)) == 0, "of axes that take no part"
 
 
 def test_a_step_is_made_by_axes_that_are_chosen_and_ends_where_it_began():

@@ -90,7 +90,7 @@ def certificate():
         requirements=(
             Requirement("velocity loop, phase margin [deg]", 45.0, 44.2, False, NEARLY_KEPT),
             Requirement("velocity loop, gain margin [dB]", 8.0, 9.5, True, KEPT),
-            Requirement("overshoot of a step of 50 counts in csp [%]", 20.0, math.nan, False, NOT_MEASURED),
+            Requirement("overshoot of a small step in csp [%]", 20.0, math.nan, False, NOT_MEASURED),
         ),
         figures=dict(zip(CROSSOVERS, (1400.0, 50.0, 35.5, 0.71), strict=True)),
         corrections=(

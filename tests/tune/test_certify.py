@@ -76,7 +76,7 @@ def kept(name, *, bound=UNBOUNDED, overshoot=0.05, **changed):
 
 
 PHASE, GAIN, MS = (f"position loop, {name}" for name in ("phase margin [deg]", "gain margin [dB]", "Ms"))
-STEP = "overshoot of a step of 50 counts in csp [%]"
+STEP = "overshoot of a small step in csp [%]"
 
 
 @pytest.mark.parametrize(("name", "given", "said"), [

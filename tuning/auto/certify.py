@@ -13,7 +13,6 @@ from mechanics.arrays import Floats
 from tuning.auto.load_step import NOISE, SWING
 from tuning.auto.loop_margins import OVERSHOOT_ERROR, AskedMargin, asked_margins
 from tuning.auto.measured_margins import LOOPS
-from tuning.auto.proving import STEP_SIZE
 from tuning.certificate.certificate import (
     CROSSOVERS,
     KEPT,
@@ -118,7 +117,7 @@ def requirements(dynamics: Dynamics, outcome: AxisResult, gains: GainSet) -> tup
     allowed = AskedMargin("", "", 100.0 * dynamics.overshoot, 100.0 * OVERSHOOT_ERROR, "%", 0, -1.0)
     overshoot = float(np.maximum(100.0 * outcome.overshoot, 0.0))
     alone = " without feed-forward" if gains.columns_of(FEED_FORWARD[0]) else ""
-    name = f"overshoot of a step of {STEP_SIZE} counts in csp{alone} [%]"
+    name = f"overshoot of a small step in csp{alone} [%]"
     return (*rows, Requirement(name, allowed.limit, overshoot, False, _kept(allowed, overshoot)))
 
 

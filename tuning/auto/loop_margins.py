@@ -19,7 +19,6 @@ from mechanics.arrays import Integers, Mask
 from tuning.auto.loop_model import LinkedAxis, LoopModel, loop_models, measured_response, one_plant
 from tuning.auto.measured_margins import LOOPS, MeasuredAxis
 from tuning.auto.model_bounds import at_least_by_model, why_unbounded
-from tuning.auto.proving import STEP_SIZE
 from tuning.auto.trying import BY_TRIAL, watch_following
 from tuning.response.measured_loop import merged
 
@@ -254,7 +253,7 @@ def _told_bounds(
 
 def tell_overshoot(bench: AutoBench, journal: Journal, overshoot: float) -> None:
     """Add a reservation if a step in csp overshoots more than the dynamics allow; reject the axis beyond "stiff"."""
-    told = f"a step of the set-point by {STEP_SIZE} counts in csp overshoots by {100.0 * overshoot:.0f} %"
+    told = f"a small step of the set-point in csp overshoots by {100.0 * overshoot:.0f} %"
     for dynamics, tell in ((bench.dynamics, journal.reserve), (find_dynamics("stiff"), journal.stop)):
         if overshoot > dynamics.overshoot + OVERSHOOT_ERROR:
             tell(f"{told}; {dynamics.name} dynamics allow {100.0 * dynamics.overshoot:.0f} %")

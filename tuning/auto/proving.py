@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drive_env import cia402, motion
-from drive_env.devices.gains import small_time_constants
+from drive_env.devices.gains import cascade_columns, loop_scales, small_time_constants
 from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count
 from drive_env.drives.interface import CYCLE
@@ -27,6 +27,7 @@ from drive_env.trials.demand import computed, is_recorded
 from drive_env.trials.gain_trial import PHASE_TITLES, PHASES, Trials, measured_cost, softness
 from drive_env.trials.oscillation import OSCILLATION, shakes
 from drive_env.trials.positioning import (
+    PROFILE,
     TRIAL,
     WATCH,
     Move,
@@ -69,6 +70,10 @@ SHORTEST = 16.0  # counts of the encoder: a shorter move proves nothing
 # one), without measurement noise.
 PLACES, REST, SETTLED, RESTLESS = 3, 6, 2, 0.05
 STEP_SIZE, STEPPING = 50, 200  # counts of a csp step, and cycles recorded after it
+# Slow loops, as on a soft shaft, need more time and a larger step: time constants of position loop and integrator that
+# a motion lasts at least, its greatest extension [s], and the current of a step by P gains over that of dry friction
+# and cogging.
+ARRIVING, LONGEST, KICK = 4.0, 1.5, 4.0
 STEP_ANGLE = STEP_SIZE / 4096 * 2.0 * math.pi  # rad, for finer encoders
 QUIETENING, NOISE_CYCLES = 50, 100  # cycles with slow outer loops: until an axis is quiet, and to measure the noise
 
@@ -243,6 +248,7 @@ class ProvingGround:
         self._fallback.begin()
         self._begin(where)
         self._hold_still(where)
+        longer = self._longer(gains, where)
         stop_causes(drives)  # discards earlier ones
         write_gains(drives, gains, where)
         write_profile(drives, self.move, where)
@@ -251,7 +257,7 @@ class ProvingGround:
         self.moves[where] += 1
         objects = [*OBJECTS, *([cia402.POSITION_DEMAND] if is_recorded(drives) else [])]
         traces, stopped = [], np.zeros(self.target.num_axes, bool)
-        for _ in range(TRIAL // WATCH):
+        for _ in range((TRIAL + longer) // WATCH):
             traces.append(drives.record(objects, WATCH * CYCLE))
             stopped |= self._stop(where & ~stopped & self._shakes(traces[-1]))
         swing = self._swing(away, where & ~stopped)
@@ -260,11 +266,11 @@ class ProvingGround:
         position, current = seen[cia402.POSITION_ACTUAL], seen[cia402.TORQUE_ACTUAL] * self._ampere
         demanded = seen.get(cia402.POSITION_DEMAND)
         if demanded is None:
-            demanded = computed(self._origin, away, self.move, TRIAL)
+            demanded = computed(self._origin, away, self.move, TRIAL + longer)
         demand, actual = (wrapped(values - self._origin) / self.move.increments for values in (demanded, position))
         way = np.sign(self._direction * self.move.distance)
         error = wrapped(position - away) * way / self._size
-        reason = self._reasons(stopped[None], error.max(axis=0), np.abs(error[-1]), stop_causes(drives))
+        reason = self._reasons(gains, stopped[None], error.max(axis=0), np.abs(error[-1]), stop_causes(drives))
         settling, noise, overshoot = move_terms(position.astype(float), current, self.move, self._t_0, rated, away, way)
         # Axes that take no part may have invalid gains.
         known = self.target.device.gains
@@ -273,38 +279,66 @@ class ProvingGround:
         self.aborts[stopped] += 1
         self._shaken |= stopped
         self._gone(where)
-        t = np.arange(len(demand), dtype=np.float64) * CYCLE
-        return Shown(t, demand, actual, current, where, reason, costs, swing, measured)
+        t = np.arange(TRIAL, dtype=np.float64) * CYCLE
+        return Shown(t, demand[:TRIAL], actual[:TRIAL], current[:TRIAL], where, reason, costs, swing, measured)
 
     def step(self, gains: Integers, where: Mask) -> Floats:
         """Return the overshoot of a csp set-point step, there and back, over the step, (num_axes,).
 
         The step is STEP_SIZE counts of an encoder with 4096 counts, or of a coarser one of the motor: small enough for
-        the loops to stay linear, and large enough for friction and noise not to matter. A first step, there and back,
-        is not counted: it releases what dry friction has stored in the integrator. Linked axes step together. The step
-        tests the loops only: feed-forward, which would respond to the step itself, is off during it.
+        the loops to stay linear, and large enough for noise not to matter. With slow loops it is larger, up to the
+        move: dry friction and cogging would hold the axis until the integrator has wound up. A first step, there and
+        back, is not counted: it releases what dry friction has stored in the integrator. Linked axes step together. The
+        step tests the loops only: feed-forward, which would respond to the step itself, is off during it.
         """
         drives, where = self.target.drives, self.target.together(where)
         self._fallback.begin()
         self._begin(where)
         self._hold_still(where)
         write_gains(drives, self.target.device.gains.without_feed_forward(gains), where)
-        size = np.rint(np.maximum(STEP_SIZE * self._count, STEP_ANGLE * self.move.increments)).astype(np.int64)
+        cycles = STEPPING + self._longer(gains, where)
+        size = self._step_size(gains)
         here = drives.read(cia402.POSITION_ACTUAL)
         motion.select_mode(drives, "csp", where)
         worst = np.zeros(self.target.num_axes)
         try:
             begin = drives.read(cia402.TARGET_POSITION)
             for end, way in ((here + size, 0), (here, 0), (here + size, 1), (here, -1)):
-                rows = np.tile(np.where(where, wrapped(end), begin), (STEPPING, 1)).astype(np.int64)
-                seen = drives.record(OBJECTS, STEPPING * CYCLE, play={cia402.TARGET_POSITION: rows})
-                beyond = (way * wrapped(seen[cia402.POSITION_ACTUAL] - end)).max(axis=0)
-                worst = np.maximum(worst, beyond / size)
+                rows = np.tile(np.where(where, wrapped(end), begin), (cycles, 1)).astype(np.int64)
+                seen = drives.record(OBJECTS, cycles * CYCLE, play={cia402.TARGET_POSITION: rows})
+                beyond = (way * np.sign(size) * wrapped(seen[cia402.POSITION_ACTUAL] - end)).max(axis=0)
+                worst = np.maximum(worst, beyond / np.abs(size))
         finally:
             motion.select_mode(drives, "pp", where)
         write_gains(drives, gains, where)
         self._begin_without_a_step(where)
-        return np.where(where, worst, np.nan)
+        return np.where(where & (np.abs(size) > self._dead_zone(gains)), worst, np.nan)
+
+    def _step_size(self, gains: Integers) -> Integers:
+        """Return the signed steps of the set-point in csp [inc], towards the end of the next move, (num_axes,)."""
+        free = np.isinf(self.target.low) & np.isinf(self.target.high)
+        least = np.maximum(STEP_SIZE * self._count, STEP_ANGLE * self.move.increments)
+        size = np.maximum(least, np.minimum(KICK * self._dead_zone(gains), np.where(free, np.inf, self._size)))
+        return np.asarray(np.rint(size * np.sign(self._direction * self.move.distance)), np.int64)
+
+    def _dead_zone(self, gains: Integers) -> Floats:
+        """Return the errors at which P gains alone overcome dry friction and cogging [inc], (num_axes,)."""
+        motor, (_, _, velocity, _, position) = self.target.motor, self._in_si(gains)
+        held = np.maximum(np.asarray(self._held[1]), 0.0) + motor.cogging_torque / motor.torque_constant
+        return np.asarray(held * self.move.increments / np.maximum(velocity * position, 1e-9))
+
+    def _in_si(self, gains: Integers) -> list[Floats]:
+        """Return the cascade's gains of all axes: duty/A, a share, A s/rad, a share, 1/s, (num_axes,) each."""
+        scales = loop_scales(self.target.device)
+        return [scales[k].value(gains[:, k]) for k in cascade_columns(self.target.device)]
+
+    def _longer(self, gains: Integers, where: Mask) -> int:
+        """Return how many cycles more than a trial lasts slow loops need to arrive: whole windows, 0 for most axes."""
+        *_, integral, position = self._in_si(gains)
+        rates = position, integral * self.target.device.velocity_rate
+        lag = sum(1.0 / np.maximum(rate, 1e-9) for rate in rates)
+        more = np.max(ARRIVING * lag, where=where, initial=0.0) - (TRIAL - PROFILE) * CYCLE
+        return WATCH * math.ceil(np.clip(more, 0.0, LONGEST) / (WATCH * CYCLE))
 
     def noise(self, gains: Integers, where: Mask) -> Floats:
         """Measure the noise of the measured current at rest, over the rated current (RMS).
@@ -395,6 +429,9 @@ class ProvingGround:
     def _run(self, gains: Integers, where: Mask) -> Proof:
         self._fallback.begin()
         self._begin(where)
+        self._trials.longer = self._longer(gains, where)
+        if self._trials.longer:
+            self._hold_still(where)
         self.moves[where] += len(PHASES)
         stop_causes(self.target.drives)  # discards earlier ones
         tried = self._trials.run(gains, self.safe, self.move, self._origin, self._direction, where)
@@ -407,8 +444,9 @@ class ProvingGround:
         self._shaken |= stopped
         # The error at the end of the move, or the present distance from its end: the demand may have stopped, too.
         now = np.abs(wrapped(self.target.drives.read(cia402.POSITION_ACTUAL) - self._origin)) / self._size
-        left = np.maximum(np.abs(tried.error[TRIAL - 1]), now)
-        return Proof(costs, self._reasons(tried.aborted, tried.terms.overshoot[:2].max(axis=0), left, causes), stopped)
+        left = np.maximum(np.abs(tried.error[-1]), now)
+        overshoot = tried.terms.overshoot[:2].max(axis=0)
+        return Proof(costs, self._reasons(gains, tried.aborted, overshoot, left, causes), stopped)
 
     def _gone(self, where: Mask) -> None:
         """Set the start of the next move to the end of this one, in the other direction."""
@@ -494,16 +532,23 @@ class ProvingGround:
         self._trials.recover(where)
         return Proof(np.full(len(where), TRIP), (why,) * len(where), where)
 
-    def _reasons(self, stopped: Mask, overshoot: Floats, left: Floats, causes: Sequence[str]) -> tuple[str, ...]:
+    def _reasons(
+        self, gains: Integers, stopped: Mask, overshoot: Floats, left: Floats, causes: Sequence[str]
+    ) -> tuple[str, ...]:
         """Return why axes fail; "" if they pass.
 
+        Any error may remain at which dry friction holds the axis against its P gains.
+
         Args:
+            gains: Raw, (num_axes, count).
             stopped: Axes that were stopped, one row per phase, (phases, num_axes).
             overshoot: Over the move, (num_axes,).
             left: Error at the end of the move, over the move, (num_axes,).
             causes: Emergencies of the drives during the trial.
         """
-        most_left = np.maximum(ASTRAY, 5.0 / np.maximum(self._counts, 1.0))
+        held = self._dead_zone(gains) / self._size
+        most_left = np.maximum(np.maximum(ASTRAY, held), 5.0 / np.maximum(self._counts, 1.0))
+        most_beyond = np.maximum(OVERSHOOT, held)
         reasons = []
         for axis, phases in enumerate(stopped.T):
             reason = ""
@@ -512,11 +557,11 @@ class ProvingGround:
                 reason = f"stopped in the {phase}: it oscillated or went into fault (cut off within 50 ms)"
                 if causes[axis] != UNTOLD:
                     reason += f"; the drive reported {causes[axis]}"
-            elif overshoot[axis] > OVERSHOOT:
-                far, most = 100.0 * overshoot[axis], 100.0 * OVERSHOOT
+            elif overshoot[axis] > most_beyond[axis]:
+                far, most = 100.0 * overshoot[axis], 100.0 * most_beyond[axis]
                 reason = f"its overshoot was {far:.0f} % of the move; {most:.0f} % is allowed"
             elif left[axis] > most_left[axis]:
-                far, most = 100.0 * left[axis], 100.0 * ASTRAY
+                far, most = 100.0 * left[axis], 100.0 * most_left[axis]
                 reason = f"its error at the end was {far:.0f} % of the move; {most:.0f} % is allowed"
             reasons.append(reason)
         return tuple(reasons)
