@@ -429,12 +429,21 @@ def test_gains_that_are_too_slow_to_arrive_do_not_pass():
         good = np.array(propose("margin_55", target.device, target.motor, plant).gains)
         slow = good.copy()
         slow[Gains._fields.index("position_p")] = max(good[-1] // 500, 1)  # tenths of a second are waited for
-        ground = ProvingGround(
-            target, [plant] * 2, (target.low, target.high), np.stack([good] * 2), np.stack([good] * 2)
-        )
+        room, safe = (target.low, target.high), np.stack([good] * 2)
+        ground = ProvingGround(target, [plant] * 2, room, safe, safe)
         proof = ground.run(np.stack([slow, good]), np.ones(2, bool))
     assert "of the move; 20 % is allowed" in proof.reason[0]
     assert proof.passed.tolist() == [False, True]
+
+
+def test_an_axis_that_does_not_move_has_passed_no_trial_whatever_friction_holds_it():
+    with emulated(load="inertia", num_threads=1) as target:
+        plant = true_plant(target.drives)
+        soft = np.array([propose("margin_55", target.device, target.motor, plant).gains]) // 40 + 1
+        target.drives.machine.set_all({"load.coulomb": 5.0, "load.breakaway": 5.0})
+        ground = ProvingGround(target, [plant], (target.low, target.high), soft, soft, (0.0, 50.0))
+        proof = ground.run(soft, np.ones(1, bool))
+    assert "its error at the end was 100 % of the move; 90 % is allowed" in proof.reason[0]
 
 
 @pytest.mark.slow

@@ -74,6 +74,9 @@ STEP_SIZE, STEPPING = 50, 200  # counts of a csp step, and cycles recorded after
 # a motion lasts at least, its greatest extension [s], and the current of a step by P gains over that of dry friction
 # and cogging.
 ARRIVING, LONGEST, KICK = 4.0, 1.5, 4.0
+# Moves: greatest such step of an axis that turns freely, within the window of following errors; and how far friction
+# may hold an axis from its end: what does not move has passed no trial.
+FREE_STEP, HELD = 8.0, 0.9
 STEP_ANGLE = STEP_SIZE / 4096 * 2.0 * math.pi  # rad, for finer encoders
 QUIETENING, NOISE_CYCLES = 50, 100  # cycles with slow outer loops: until an axis is quiet, and to measure the noise
 
@@ -318,7 +321,8 @@ class ProvingGround:
         """Return the signed steps of the set-point in csp [inc], towards the end of the next move, (num_axes,)."""
         free = np.isinf(self.target.low) & np.isinf(self.target.high)
         least = np.maximum(STEP_SIZE * self._count, STEP_ANGLE * self.move.increments)
-        size = np.maximum(least, np.minimum(KICK * self._dead_zone(gains), np.where(free, np.inf, self._size)))
+        most = np.where(free, FREE_STEP, 1.0) * self._size
+        size = np.maximum(least, np.minimum(KICK * self._dead_zone(gains), most))
         return np.asarray(np.rint(size * np.sign(self._direction * self.move.distance)), np.int64)
 
     def _dead_zone(self, gains: Integers) -> Floats:
@@ -537,7 +541,7 @@ class ProvingGround:
     ) -> tuple[str, ...]:
         """Return why axes fail; "" if they pass.
 
-        Any error may remain at which dry friction holds the axis against its P gains.
+        An error may remain at which dry friction holds the axis against its P gains, up to HELD.
 
         Args:
             gains: Raw, (num_axes, count).
@@ -546,7 +550,7 @@ class ProvingGround:
             left: Error at the end of the move, over the move, (num_axes,).
             causes: Emergencies of the drives during the trial.
         """
-        held = self._dead_zone(gains) / self._size
+        held = np.minimum(self._dead_zone(gains) / self._size, HELD)
         most_left = np.maximum(np.maximum(ASTRAY, held), 5.0 / np.maximum(self._counts, 1.0))
         most_beyond = np.maximum(OVERSHOOT, held)
         reasons = []
