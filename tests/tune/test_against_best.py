@@ -63,7 +63,9 @@ def test_they_are_a_file_of_the_comparison(tmp_path):
 
 
 def test_searches_take_another_number_of_trials():
-    assert Settings(**find_tuner("tpe-safe", 100).keywords) == Settings(sampler="tpe", trials=100, safe=True)
+    assert Settings(**find_tuner("tpe-safe", 100).keywords) == Settings(
+        sampler="tpe", trials=100, safe=True, dynamics="standard"
+    )
     assert find_tuner("cmaes").keywords["trials"] == 20
     assert find_tuner("grid", 100).keywords["trials"] == 28  # its points are what they are
     assert callable(find_tuner("baseline", 100))
