@@ -39,6 +39,7 @@ def test_what_is_only_read_by_a_type_checker_is_left_alone():
     assert not any(first <= place < last for first, last in silent for place in [(2, 22), (3, 22), (4, 11)])
 
 
+@pytest.mark.slow
 def test_a_sample_is_the_same_for_a_seed_and_has_a_line_once():
     pytest.importorskip("cosmic_ray", reason="install the extra 'mutation'")
     found = mutation.sample(QUICK, 20, 3)

@@ -58,6 +58,7 @@ from drive_env.safety.objects import (
     VL_QUICK_STOP,
     VL_REFERENCE,
     VL_TARGET,
+    is_one_of,
 )
 from drive_env.safety.rotor import scale_objects
 from drive_env.safety.stop_ends import LATENCY, outside, profile_way, ramp_way
@@ -163,7 +164,7 @@ class Commands:
             return
         self._set_points[key] = np.where(where, raw, self._set_points.get(key, 0))
         if key in (TARGET_POSITION, POSITION_OFFSET):
-            led = where & self._axes.live & np.isin(self._axes.mode, LED_MODES)
+            led = where & self._axes.live & is_one_of(self._axes.mode, LED_MODES)
             other = self._set_points.get(POSITION_OFFSET if key == TARGET_POSITION else TARGET_POSITION, 0)
             self._axes.led = np.where(led, self._set_points[key] + other, self._axes.led)
         if key in _PARTNERS:
@@ -282,7 +283,7 @@ class Commands:
             self._check_position(entry, self._target(key, raw), where, LED_MODES)
         elif key in (TARGET_POSITION, POSITION_OFFSET):
             other = self._last(POSITION_OFFSET if key == TARGET_POSITION else TARGET_POSITION)
-            if key == TARGET_POSITION or np.isin(self._modes(), LED_MODES).any():
+            if key == TARGET_POSITION or is_one_of(self._modes(), LED_MODES).any():
                 self._check_position(entry, raw + other, where, LED_MODES)
                 self._check_jumps(entry, raw + other, where)
         elif key == QUICK_STOP_DECELERATION:
@@ -334,7 +335,7 @@ class Commands:
             return
         # Reading the mode costs an SDO transfer (half a millisecond of a policy's cycle): only where it matters.
         rows, outside = np.atleast_2d(aim), np.atleast_2d(outside)
-        if (wrong := np.flatnonzero(axes & outside.any(axis=0) & np.isin(self._modes(), modes))).size:
+        if (wrong := np.flatnonzero(axes & outside.any(axis=0) & is_one_of(self._modes(), modes))).size:
             axis = int(wrong[0])
             farthest = rows[outside[:, axis], axis][0]
             origin = self._limits.origin(self._limits.user.position, "position", "607Dh")
@@ -359,7 +360,7 @@ class Commands:
         if np.all(jump <= limit * cycle):
             return
         period = np.maximum(self._interpolation_period(), cycle)
-        wrong = axes & self._axes.live & (jump > limit * period) & np.isin(self._modes(), LED_MODES)
+        wrong = axes & self._axes.live & (jump > limit * period) & is_one_of(self._modes(), LED_MODES)
         for axis in np.flatnonzero(wrong).tolist():
             raise SafetyError(
                 f"axis {axis}: {entry.label} would jump by {jump[axis]:.0f} increments within "
@@ -385,10 +386,10 @@ class Commands:
             return
         ramp = np.where(modes == PP, profile_way(bounds, speed), ramp_way(bounds, speed) + speed * bounds.lag)
         beyond = outside(bounds, self._axes.position + ramp)
-        wrong = axes & np.isin(modes, (PP, *LED_MODES)) & (np.abs(speed) > bounds.rest)
+        wrong = axes & is_one_of(modes, (PP, *LED_MODES)) & (np.abs(speed) > bounds.rest)
         wrong &= beyond > np.maximum(outside(bounds, self._axes.position), bounds.slack)
         behind = np.abs(np.nan_to_num(self._axes.led - self._axes.position)) > bounds.slack
-        distant = behind & np.isin(self._axes.mode, LED_MODES)
+        distant = behind & is_one_of(self._axes.mode, LED_MODES)
         moves = axes & (modes == HM) & ((np.abs(ramp) > bounds.slack) | distant)
         for axis in np.flatnonzero(moves & (self._modes() != modes)).tolist():
             raise SafetyError(
@@ -474,7 +475,7 @@ class Commands:
         self._check_stops_turning(entry, raw, ramp, where)
         axes = where & self._axes.may_turn
         if np.any(slow := axes & (ramp < self._unramped_ramp())):
-            self._refuse_mode(slow & np.isin(self._modes(), UNRAMPED_MODES), ramp)
+            self._refuse_mode(slow & is_one_of(self._modes(), UNRAMPED_MODES), ramp)
         in_vl = np.any(read_vl_rate(self._drives, VL_QUICK_STOP, self._axes.rotor) > 0.0)  # vl has its own ramp
         modes = np.where(in_vl & (self._modes() == VL), 0, self._modes())
         self._check_speeds(axes, modes, {**RUNNING_SPEEDS, **MOVING_SPEEDS}, raw * STOP_WITHIN)
@@ -522,7 +523,7 @@ class Commands:
         known, key = self._drives.description, QUICK_STOP_DECELERATION
         if known.has(key):
             slow = axes & ~np.isnan(self._ramp_count()) & (bounds.braking < self._unramped_ramp())
-            self._refuse_mode(slow & np.isin(now, UNRAMPED_MODES).any(axis=0), bounds.braking)
+            self._refuse_mode(slow & is_one_of(now, UNRAMPED_MODES).any(axis=0), bounds.braking)
         for row in np.unique(now, axis=0):
             self._check_speeds(axes, row, RUNNING_SPEEDS, bounds.velocity, played)
 

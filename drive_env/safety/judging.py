@@ -14,7 +14,7 @@ from drive_env.drives.limits import NO_LIMIT
 from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import Bounds
 from drive_env.safety.limits_in_force import LimitsInForce, bound_text
-from drive_env.safety.objects import CURRENT, DEMAND, HM, LED_MODES, POSITION, PP, STATUSWORD
+from drive_env.safety.objects import CURRENT, DEMAND, HM, LED_MODES, POSITION, PP, STATUSWORD, is_one_of
 from drive_env.safety.oscillation import SWING, SWING_WINDOW, SWINGS, Swings
 from drive_env.safety.rotor import wrapped
 from drive_env.safety.stop_ends import StopEnds, by_position, ends_by_itself, is_led, sees_demand
@@ -158,7 +158,7 @@ class Judging:
         # Reading the mode costs an SDO transfer: only where it matters.
         if not np.any(judged & (largest > bounds.following)):
             return
-        follows = np.isin(self._modes(), (PP, *LED_MODES))
+        follows = is_one_of(self._modes(), (PP, *LED_MODES))
         self._trip(
             judged,
             np.where(follows, largest, 0),

@@ -24,7 +24,7 @@ from drive_env.drives.limits import NO_LIMIT
 from drive_env.safety.axes import Axes
 from drive_env.safety.bounds import Bounds
 from drive_env.safety.limits_in_force import STOP_WITHIN
-from drive_env.safety.objects import CSP, CSV, CURRENT, HM, IP, PP, TORQUE_MODES
+from drive_env.safety.objects import CSP, CSV, CURRENT, HM, IP, PP, TORQUE_MODES, is_one_of
 from mechanics.arrays import Floats, Integers, Mask
 
 LATENCY = 0.010  # s from a sample to the drive's ramp
@@ -140,7 +140,7 @@ class StopEnds:
     def _held(self, bounds: Bounds) -> Floats:
         """Return the extra way [inc] that comes from the current held in the velocity loop's integral."""
         axes, way = self._axes, np.sign(self.speed)
-        torque = np.isin(axes.mode, TORQUE_MODES)
+        torque = is_one_of(axes.mode, TORQUE_MODES)
         asked = np.where(torque, axes.asked_current, 0.0)
         speeds_up = self._gain > SPEEDS_UP * bounds.braking
         is_short = np.abs(self._current) < SHORT * np.abs(asked)

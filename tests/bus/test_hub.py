@@ -408,6 +408,7 @@ def test_clients_that_leave_frames_behind_do_not_pile_up(monkeypatch):
             assert is_answered(bus)
 
 
+@pytest.mark.slow
 def test_a_crowd_does_not_fill_the_log(monkeypatch, hub, caplog):
     monkeypatch.setattr("drive_env.bus.hub.MAX_CLIENTS", 1)
     connections = crowd(hub, 5 * LOG_LINES)

@@ -129,7 +129,7 @@ def test_what_is_left_of_a_run(tmp_path):
     assert json.dumps(bundle.card)
 
 
-@pytest.mark.every(6)
+@pytest.mark.slow
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_the_bundle_acts_as_the_model(algorithm, tmp_path):
     bundle = train(tiny(algorithm=algorithm), tmp_path)
@@ -314,7 +314,7 @@ def test_there_are_hyperparameters_for_every_environment_and_algorithm(environme
     env.close()
 
 
-@pytest.mark.every(10)
+@pytest.mark.slow
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 @pytest.mark.parametrize("environment", ["gain_tuning", "gain_scheduling"])
 def test_every_environment_trains(environment, algorithm, tmp_path):

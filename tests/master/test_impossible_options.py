@@ -105,6 +105,7 @@ def test_a_replay_waits_for_no_stamp_that_never_comes(stamp, ending, tmp_path, m
         assert found.output.strip().count("\n") == 0
 
 
+@pytest.mark.slow
 def test_a_replay_goes_at_the_pace_of_its_stamps(files_read_here, tmp_path):
     file = tmp_path / "frames.log"
     file.write_text("(1e6) can0 601#4041600000000000\n(1000000.01) can0 601#4041600000000000\n")

@@ -197,7 +197,7 @@ def test_moves_that_auto_measured_are_among_the_steps(desk, tmp_path, reason):
     t = np.arange(300) * 1e-3
     demand = np.minimum(t / 0.1, 1.0)[:, None] * np.pi
     shown = Shown(
-        t, demand, 0.99 * demand, np.ones((300, 1)), np.array([True]), ("",), np.zeros(1), np.zeros(1), np.zeros(1)
+        t, demand, 0.99 * demand, np.ones((300, 1)), np.array([True]), ("",), *np.zeros((4, 1))
     )  # fmt: skip
     axis = AxisResult((1, 2, 3, 4, 5), (1, 2, 3, 4, 5) if reason else (6, 7, 8, 9, 10), reason)
     none = np.zeros(1)

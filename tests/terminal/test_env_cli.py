@@ -603,6 +603,7 @@ def test_scope_ends_where_another_master_begins_and_no_sample_is_wrong(run, shar
     assert after[:1] == before[:1] and after[-4:] == before[-4:]  # what nobody else has touched is as it was
 
 
+@pytest.mark.slow
 def test_what_scope_writes_by_default_compare_takes(run, tmp_path):
     code, _, error = run("scope", "--duration", 0.1, "--out", tmp_path / "trace")
     assert code == DONE, error

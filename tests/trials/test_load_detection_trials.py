@@ -41,6 +41,7 @@ def test_the_angle_of_a_reading_is_that_of_its_closed_form():
     assert np.isnan(angle_of(np.array([1.5]))).all()
 
 
+@pytest.mark.slow
 def test_a_trial_tells_false_and_late_stalls_and_what_coolstep_saves():
     with target() as found:
         bench = TrialBench(found, gains=NAMES)

@@ -435,6 +435,8 @@ def test_soft_shafts_whose_oracle_keeps_the_constraints_are_accepted_with_true_m
     with target.drives:
         axis = auto(target, tmp_path / "before.toml", keep=False).axes[0]
         assert axis.accepted, axis.reason
+        # Friction holds the second one for longer than its recorded move lasts: the verdict says so.
+        assert any("of the way from its target" in text for text in axis.reservations) == (name == list(SOFT)[1])
         found = CascadeGains.of(DEVICE, np.array([[axis.after]]))
         true = worst_margins(LoopRates.of(DEVICE), true_machines(target.drives), found)
         assert true.phase_deg >= 40.0 and true.gain_db >= 7.0 and true.ms <= 2.1

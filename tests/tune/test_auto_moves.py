@@ -137,7 +137,7 @@ def moved(cost):
     """Return a recorded move of axes that cost this, (num_axes,)."""
     cost, n = np.array(cost), len(cost)
     row = cost[None]
-    return Shown(np.zeros(1), row, row, row, np.ones(n, bool), ("",) * n, cost, np.zeros(n), np.zeros(n))
+    return Shown(np.zeros(1), row, row, row, np.ones(n, bool), ("",) * n, cost, *np.zeros((3, n)))
 
 
 def bench_of_pairs(num_axes):

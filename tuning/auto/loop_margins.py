@@ -177,6 +177,9 @@ def judge(bench: AutoBench, basis: Basis, recorded: RecordedGains) -> RecordedGa
     for k in map(int, np.flatnonzero(bench.going)):
         journal, response = bench.journals[k], recorded.response
         tell_overshoot(bench, journal, float(recorded.overshoot[k]))
+        if recorded.shown is not None and recorded.shown.where[k] and recorded.shown.left[k] > 0.0:
+            journal.reserve(f"its move ended {100.0 * recorded.shown.left[k]:.0f} % of the way from its target: dry "
+                            "friction held the axis, which the gains overcome slowly")  # fmt: skip
         measured = measured_axis(bench, basis, recorded, k)
         if measured is None:
             why = recorded.unseen[k] or (NO_PART if bench.target.linked else "no response was measured")

@@ -110,6 +110,7 @@ class Shown(NamedTuple):
         positions), (num_axes,).
     noise: Part of it caused by the measurement of the current, (num_axes,); 0 if not measured because the swing is
         below its limit.
+    left: Error that was left at the end, over the move, (num_axes,); 0 where it is no more than fast loops may leave.
     """
 
     t: Floats
@@ -121,6 +122,7 @@ class Shown(NamedTuple):
     cost: Floats
     swing: Floats
     noise: Floats
+    left: Floats
 
     @property
     def restless(self) -> Mask:
@@ -273,7 +275,8 @@ class ProvingGround:
         demand, actual = (wrapped(values - self._origin) / self.move.increments for values in (demanded, position))
         way = np.sign(self._direction * self.move.distance)
         error = wrapped(position - away) * way / self._size
-        reason = self._reasons(gains, stopped[None], error.max(axis=0), np.abs(error[-1]), stop_causes(drives))
+        left = np.abs(error[-1])
+        reason = self._reasons(gains, stopped[None], error.max(axis=0), left, stop_causes(drives))
         settling, noise, overshoot = move_terms(position.astype(float), current, self.move, self._t_0, rated, away, way)
         # Axes that take no part may have invalid gains.
         known = self.target.device.gains
@@ -283,7 +286,9 @@ class ProvingGround:
         self._shaken |= stopped
         self._gone(where)
         t = np.arange(TRIAL, dtype=np.float64) * CYCLE
-        return Shown(t, demand[:TRIAL], actual[:TRIAL], current[:TRIAL], where, reason, costs, swing, measured)
+        rows = t, demand[:TRIAL], actual[:TRIAL], current[:TRIAL]
+        left = left * (left > self._astray())
+        return Shown(*rows, where, reason, costs, swing, measured, left)
 
     def step(self, gains: Integers, where: Mask) -> Floats:
         """Return the overshoot of a csp set-point step, there and back, over the step, (num_axes,).
@@ -536,6 +541,10 @@ class ProvingGround:
         self._trials.recover(where)
         return Proof(np.full(len(where), TRIP), (why,) * len(where), where)
 
+    def _astray(self) -> Floats:
+        """Return the greatest error that may be left without dry friction, over the move, (num_axes,)."""
+        return np.maximum(ASTRAY, 5.0 / np.maximum(self._counts, 1.0))
+
     def _reasons(
         self, gains: Integers, stopped: Mask, overshoot: Floats, left: Floats, causes: Sequence[str]
     ) -> tuple[str, ...]:
@@ -551,7 +560,7 @@ class ProvingGround:
             causes: Emergencies of the drives during the trial.
         """
         held = np.minimum(self._dead_zone(gains) / self._size, HELD)
-        most_left = np.maximum(np.maximum(ASTRAY, held), 5.0 / np.maximum(self._counts, 1.0))
+        most_left = np.maximum(self._astray(), held)
         most_beyond = np.maximum(OVERSHOOT, held)
         reasons = []
         for axis, phases in enumerate(stopped.T):
