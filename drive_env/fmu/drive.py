@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,6 +28,7 @@ from drive_env.fmu.variables import (
     SWITCHES,
     WRITTEN,
     FmuVariable,
+    VariableRow,
     variables_of,
 )  # fmt: skip
 from drive_env.saved_state import Saved
@@ -164,28 +167,42 @@ class FmuDrive(Saved):
     def _process_data(self) -> dict[Any, Integers]:
         """Apply the inputs that are not set-points, and return the set-points: object -> a row of integers.
 
-        No input is applied if an object cannot have its value.
+        No input is applied if one of them is refused.
         """
-        drives, values, known = self.drives, dict[str, Floats](), self.drives.inside.objects.entries
+        known = self.drives.inside.objects.entries
         rows = {one.row.name: one.row for one in self.variables if one.row.causality == INPUT}
-        for one in self.variables:
-            if one.row.causality == INPUT:
-                values.setdefault(one.row.name, np.zeros(drives.num_axes))[list(one.axes)] = self._given[one.name]
+        values, before = self._inputs(self._given), self._inputs(self._applied)
         played = {
             name: np.asarray(values[name], np.int64) for name, row in rows.items() if not isinstance(row.source, str)
         }
         for name, integers in played.items():
             check_in_range(known.find(rows[name].source), integers)
-        changed = {one.row.name: one.row for one in self._changed(INPUT)}
-        for name, row in changed.items():
-            if name in WRITTEN:
-                before = np.array([self._applied[one.name] for one in self.variables if one.row.name == name])
-                drives.write(row.source, played[name], played[name] != before)
-            elif row.source in SWITCHES:
-                drives.machine.press(row.source, values[name] > 0.0)
-            elif row.source == "load_torque":
-                drives.machine.load_torque = values[name][:: drives.load.num_axes]
-            elif isinstance(row.source, str):
-                setattr(drives.machine, row.source, values[name])
+        changed = [row for name, row in rows.items() if np.any(values[name] != before[name])]
+        with ExitStack() as undoing:
+            # Objects last: a drive may refuse to have its former mode again, a machine takes its former values.
+            for row in sorted(changed, key=lambda row: row.name in WRITTEN):
+                self._apply(row, values[row.name], before[row.name])
+                undoing.callback(self._apply, row, before[row.name], values[row.name])
+            undoing.pop_all()
         self._applied |= {one.name: self._given[one.name] for one in self._changed(INPUT)}
         return {rows[name].source: integers[None] for name, integers in played.items() if name not in WRITTEN}
+
+    def _inputs(self, values: Mapping[str, Any]) -> dict[str, Floats]:
+        """Return the inputs among values by variable, as those by row, shape (num_axes,)."""
+        found = dict[str, Floats]()
+        for one in self.variables:
+            if one.row.causality == INPUT:
+                found.setdefault(one.row.name, np.zeros(self.drives.num_axes))[list(one.axes)] = values[one.name]
+        return found
+
+    def _apply(self, row: VariableRow, values: Floats, before: Floats) -> None:
+        """Apply an input, shape (num_axes,); one that is a set-point is only played."""
+        machine = self.drives.machine
+        if row.name in WRITTEN:
+            self.drives.write(row.source, values.astype(np.int64), values != before)
+        elif row.source in SWITCHES:
+            machine.press(row.source, values > 0.0)
+        elif row.source == "load_torque":
+            machine.load_torque = values[:: self.drives.load.num_axes]
+        elif isinstance(row.source, str):
+            setattr(machine, row.source, values)

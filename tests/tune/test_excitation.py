@@ -106,7 +106,7 @@ def test_an_axis_that_does_not_answer_at_all_is_no_division_by_zero():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ((5.0, 400.0, 3.1, 1000.0), r"resolution 3\.1 Hz must divide 1000 Hz; use 3\.09598 Hz"),
+        ((5.0, 400.0, 3.1, 1000.0), r"resolution 3\.1 Hz must divide 1000 Hz; use 3\.09597523"),
         ((5.0, 500.0, 5.0, 1000.0), r"highest frequency 500 Hz must be below 500 Hz"),
         ((2.0, 400.0, 5.0, 1000.0), r"the resolution must be above 0 and at most the lowest frequency"),
         ((50.0, 40.0, 5.0, 1000.0), r"that below the highest"),
@@ -115,6 +115,13 @@ def test_an_axis_that_does_not_answer_at_all_is_no_division_by_zero():
 def test_frequencies_that_cannot_be_are_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         plan_lines(*arguments)
+
+
+@pytest.mark.parametrize("resolution", [0.3, 3.0, 3.1])
+def test_the_resolution_that_a_refusal_gives_is_accepted(resolution):
+    with pytest.raises(ValueError, match="must divide 1000 Hz") as refused:
+        plan_lines(5.0, 400.0, resolution, 1000.0)
+    plan_lines(5.0, 400.0, float(str(refused.value).split()[-2]), 1000.0)
 
 
 def test_an_unknown_excitation_is_refused_with_those_there_are():
@@ -146,7 +153,7 @@ def test_lines_lie_within_the_range(low, high, resolution, rate, lines):
         ((5.0, 9.0, 0.0, 1000.0), "every 0 Hz is impossible"),
         ((5.0, 9.0, -1.0, 1000.0), "every -1 Hz is impossible"),
         ((5.0, 500.1, 5.0, 1000.0), "highest frequency 500.1 Hz must be below 500 Hz, half the bus's rate"),
-        ((5.0, 9.0, 1.0000001, 1000.0), "resolution 1 Hz must divide 1000 Hz; use 1 Hz"),
+        ((5.0, 9.0, 1.0000001, 1000.0), "resolution 1.0000001 Hz must divide 1000 Hz; use 1 Hz"),
     ],
 )
 def test_ranges_that_cannot_be_are_refused(arguments, message):

@@ -47,7 +47,7 @@ def plan_lines(low: float, high: float, resolution: float, rate: float) -> Lines
         )
     samples = round(rate / resolution)
     if abs(samples * resolution - rate) > 1e-9 * rate:
-        raise ValueError(f"resolution {resolution:g} Hz must divide {rate:g} Hz; use {rate / samples:g} Hz")
+        raise ValueError(f"resolution {resolution:.12g} Hz must divide {rate:g} Hz; use {rate / samples:.12g} Hz")
     if high >= 0.5 * rate:
         raise ValueError(f"highest frequency {high:g} Hz must be below {0.5 * rate:g} Hz, half the bus's rate")
     first, last = math.ceil(low / resolution - 1e-9), math.floor(high / resolution + 1e-9)
