@@ -298,7 +298,7 @@ def _write(path: Path, environment: str, best: Mapping[str, Any], study: Any, tr
 
 
 def drawn(algorithm: str, hyperparameters: Mapping[str, Any], trial: Any) -> dict[str, Any]:
-    """Return hyper-parameters with a trial's values."""
+    """Return hyper-parameters with the values that a trial draws; ValueError for an algorithm not in SPACES."""
     if algorithm not in SPACES:
         raise ValueError(f"there is no algorithm {algorithm!r}; there are {', '.join(ALGORITHMS)}")
     found: dict[str, Any] = copy.deepcopy(dict(hyperparameters))

@@ -55,12 +55,12 @@ def environment_name(text: str) -> str:
 
 
 def row_of(environment: str) -> TrainingTask:
-    """Return the row of ENVIRONMENTS for an environment; for a task of the suite, that of its environment."""
+    """Return the row of ENVIRONMENTS for the full name of an environment or task; KeyError for an unknown one."""
     return ENVIRONMENTS[environment_of(environment)]
 
 
 def short_name(environment: str) -> str:
-    """Return the name of an environment's or a task's files."""
+    """Return an environment's or a task's name in names of files: without namespace and version."""
     if environment in ENVIRONMENTS:
         return ENVIRONMENTS[environment].short
     return "".join(f"_{c.lower()}" if c.isupper() else c for c in environment.partition("/")[2].partition("-")[0])[1:]

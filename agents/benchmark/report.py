@@ -164,7 +164,7 @@ def _curves(policies: Mapping[str, Sequence[Row]]) -> list[str]:
 
 
 def _draw(folder: Path, task: str, policies: Mapping[str, Sequence[Row]]) -> None:
-    """Draw the episodes of the trainings: the interquartile mean over seeds, and all of them behind it."""
+    """Draw a task's trainings, with 95 % intervals over seeds, and all held-out scores; nothing without a training."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -204,7 +204,7 @@ def _draw(folder: Path, task: str, policies: Mapping[str, Sequence[Row]]) -> Non
 
 
 def _curve(table: Path, task: str) -> Floats:
-    """Return steps and return over the horizon of a training, shape (rows, 2), from the first episode's end on."""
+    """Return steps and return over the horizon, shape (rows, 2), of the rows of a training that have a return."""
     names, *rows = read_rows_of(table)
     step, total = names.index("timesteps"), names.index("return")
     points = [(float(row[step]), float(row[total] or "nan") / TASKS[task].steps) for row in rows]

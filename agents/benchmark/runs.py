@@ -68,11 +68,11 @@ class BenchmarkRun:
         what = {
             "hyper-parameters": (row.hyperparameters, dict(self.hyperparameters)),
             "episodes": (len(row.scores), self.episodes),
-            "a policy": (row.policy_sha256, row.policy_sha256 if self.written is None else self.written.sha256),
+            "policy": (row.policy_sha256, row.policy_sha256 if self.written is None else self.written.sha256),
         }
         for name, (there, here) in what.items():
             if there != here:
-                raise ValueError(f"{path} is of {name} other than are asked for now; give another --out")
+                raise ValueError(f"{path} was made with other {name} than this run has; give another --out")
 
 
 class _Done(NamedTuple):

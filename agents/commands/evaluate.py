@@ -267,7 +267,7 @@ def opened_for(
     otherwise: str | None = None,
     trust: bool = False,
 ) -> tuple[Any, dict[str, Any]]:
-    """Return the policy, its environment filled in (`otherwise` if it names none), and the environment's options."""
+    """Return the policy with its environment (by default `otherwise`) and options; ValueError if they do not fit."""
     import tomllib
 
     from agents.evaluation.open_policy import LoadedPolicy, is_baseline, is_checkpoint, open_policy, opened
@@ -424,7 +424,7 @@ def _replay(loaded: Any, configuration: dict[str, Any], path: Path, recording: A
 
     if recording.environment != loaded.environment:
         raise ValueError(f"{path} was recorded in {recording.environment}, and {loaded.name} acts in "
-                         f"{loaded.environment}")  # fmt: skip
+                         f"{loaded.environment}; give a recording of that")  # fmt: skip
     with progress_bar("repeating") as show:
         found = episode_log.repeat(loaded.policy, recording, told=show)
     if json:

@@ -58,7 +58,7 @@ def margins(
                 if out is not None and asked is not None:
                     if bundle is None or "observation_scale" not in bundle.arrays:
                         raise ValueError(
-                            f"{policy} is not an agent that drive-agent trained, and --out changes these alone"
+                            f"{policy} was not trained by drive-agent, and --out changes only such agents; leave it out"
                         )
                     agent, found = within(bundle, asked, told=show)
                 else:

@@ -147,7 +147,7 @@ def figures(found: Sensitivity) -> dict[str, float]:
 
 
 def _answering(bundle: AgentFile, share: float) -> AgentFile:
-    """Return an agent that sees only a share of the errors of position and speed."""
+    """Return the agent with a share of its response to the errors of position and speed."""
     mean, scale = (np.array(bundle.arrays[f"observation_{name}"], float) for name in ("mean", "scale"))
     for axis in range(len(mean) // AXIS_ENTRIES):
         for entry in ERRORS:

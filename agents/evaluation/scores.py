@@ -163,7 +163,7 @@ class Interval(NamedTuple):
 
 
 def interval(values: Any) -> Interval:
-    """Return mean, percentile bootstrap interval (95 %) and median of a figure; NaN ones are left out."""
+    """Return mean, percentile bootstrap interval (95 %), median and number of finite values; NaN without any."""
     found = np.asarray(values, float)
     found = found[np.isfinite(found)]
     if not len(found):

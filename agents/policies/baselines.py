@@ -64,7 +64,7 @@ class ControlLaw:
 
 
 def state_feedback(configuration: Any) -> ControlLaw:
-    """Return the control law that balances the inverted pendulum in cst: BALANCE times its state."""
+    """Return the law that balances the inverted pendulum in cst: BALANCE times the state; ValueError elsewhere."""
     if configuration.load != "inverted_pendulum" or configuration.mode != "cst" or configuration.action != "direct":
         raise ValueError(
             "the baseline state_feedback is for load inverted_pendulum, mode cst and action direct alone; here they "
@@ -76,7 +76,7 @@ def state_feedback(configuration: Any) -> ControlLaw:
 
 
 def feed_forward(configuration: Any, lags: Any = None) -> ControlLaw:
-    """Return the identified feed-forward for a configuration of Tracking whose action is the offset.
+    """Return the identified feed-forward for a configuration of Tracking; ValueError unless its action is the offset.
 
     csp: 60B0h leads by the lags, those of the load or given ones, each a number or of shape (environments, axes). csv:
     a position loop in the master, and 60B1h adds the velocity for the acceleration. In cst it is 0: the profile already
@@ -112,7 +112,7 @@ def feed_forward(configuration: Any, lags: Any = None) -> ControlLaw:
 
 
 def surrogate(configuration: Any) -> Any:
-    """Return the shipped tuner for a configuration of GainTuning with the gains that it was trained for."""
+    """Return the shipped tuner for a configuration of GainTuning; ValueError if it was trained for another one."""
     from agents.policies.agent_file import AgentFile
     from agents.policies.policy import policy_of
     from agents.shipped import TUNER, shipped

@@ -241,7 +241,7 @@ class HighestSpeed(Expert):
     SHARE, GAIN = 0.96, 3.0  # of the highest; of the greatest change of the rate, of `speed`
 
     def actions(self, rows: Floats) -> Floats:
-        """Return the change of the step rate as a share of the largest change."""
+        """Return the change of the step rate as a share of the largest; ValueError before `told`."""
         if not self._machine:
             raise ValueError("the oracle must be told the true machine, which no bus tells; take the expert")
         speed = self.SHARE * self._highest / (2.0 * np.pi * self.configuration.speed)

@@ -105,7 +105,7 @@ class GuardedPolicy:
         self._ask(self._policy.reset, mask, within=self._limits.stall)
 
     def told(self, parameters: Any, mask: Mask) -> None:
-        """Notify a policy that has `told` of the starting machines."""
+        """Pass the parameters of starting machines to the policy's `told`, if there are both."""
         if parameters is not None and hasattr(self._policy, "told"):
             self._ask(lambda known: self._policy.told(known, mask), parameters, within=self._limits.stall)
 
@@ -238,7 +238,7 @@ def stop(drives: Drives, reason: str) -> None:
 
 
 def come_to_rest(drives: Drives) -> None:
-    """Quick-stop the drives, wait for the end of the ramp, and switch the voltage off."""
+    """Quick-stop the drives, wait for the end of the ramp, STOP_TIMEOUT at most, and switch the voltage off."""
     motion.quick_stop(drives)
     first = np.abs(drives.read(cia402.VELOCITY_ACTUAL))
     for _ in range(round(STOP_TIMEOUT / CYCLE)):

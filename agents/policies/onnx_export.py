@@ -99,14 +99,13 @@ def export(bundle: AgentFile, path: str | Path) -> float:
     return worst
 
 
-def compare(bundle: AgentFile, path: str | Path, act: Callable[[Any], Any] | None = None, steps: int = 200) -> float:
+def compare(bundle: AgentFile, path: str | Path, act: Callable[[Any], Any] | None = None) -> float:
     """Return the largest difference of an ONNX model's actions from another policy's, as a share of their range.
 
     Args:
         bundle: The agent.
         path: The ONNX model.
         act: The function to compare with; the bundle's own NumPy runtime by default.
-        steps: Steps of 16 environments, for policies with a state.
     """
     from agents.policies.onnx_policy import OnnxPolicy
     from agents.policies.policy import policy_of
@@ -114,13 +113,13 @@ def compare(bundle: AgentFile, path: str | Path, act: Callable[[Any], Any] | Non
     one, two = OnnxPolicy(path), act or policy_of(bundle).act
     span = np.asarray(bundle.arrays["action_high"]) - np.asarray(bundle.arrays["action_low"])
     worst = 0.0
-    for rows in trial_observations(bundle, steps):
+    for rows in trial_observations(bundle):
         worst = max(worst, float(np.max(np.abs(one.act(rows) - two(rows)) / span)))
     return worst
 
 
 def trial_observations(bundle: AgentFile, steps: int = 200) -> Singles:
-    """Return observations in the range of a training and far beyond, shape (steps, 16, entries)."""
+    """Return observations in the range of a training and far beyond, shape (steps, 16 environments, entries)."""
     mean, scale = bundle.arrays["observation_mean"], bundle.arrays["observation_scale"]
     rng = np.random.default_rng(0)
     spread = np.exp(rng.uniform(np.log(0.1), np.log(20.0), (steps, 16, 1)))

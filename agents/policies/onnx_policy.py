@@ -80,7 +80,7 @@ class OnnxPolicy:
             self._carried = {name: np.zeros((self._lanes, cells), np.float32) for name, cells in self._cells.items()}
         try:
             action, *after = self._session.run(self._outputs, {"observation": rows, **self._carried})
-        except Exception as error:  # as above
+        except Exception as error:  # onnxruntime raises exceptions of its own library
             raise PolicyError(f"the ONNX model does not take this observation: {str(error).splitlines()[0]}") from None
         self._carried = dict(zip(self._carried, after, strict=True))
         if not np.isfinite(action).all():

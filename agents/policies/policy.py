@@ -41,7 +41,7 @@ def load_policy(path: str | Path) -> Any:
 
 
 def policy_of(bundle: AgentFile) -> Any:
-    """Return the policy of a bundle, by its kind."""
+    """Return the policy of a bundle; BundleError for an unknown kind, or arrays and settings that do not fit it."""
     if bundle.kind not in KINDS:
         raise BundleError(f"an agent of kind {bundle.kind!r} needs a newer drive-env; this one has {', '.join(KINDS)}")
     module, _, name = KINDS[bundle.kind].partition(":")
@@ -105,7 +105,7 @@ class Ends:
         self._output = OUTPUTS[_choice("output", settings["output"], OUTPUTS)]
 
     def enter(self, observation: ArrayLike) -> Singles:
-        """Return the normalised observations, shape (environments, entries)."""
+        """Return normalised observations, shape (environments, entries); PolicyError for another shape or NaN."""
         x = np.asarray(observation)
         if x.shape[-1:] != self.mean.shape or x.ndim > 2:
             raise PolicyError(
@@ -120,7 +120,7 @@ class Ends:
         return np.atleast_2d(x.astype(np.float32))
 
     def leave(self, x: Singles, observation: ArrayLike) -> Singles:
-        """Return the action of a network's output, in the observation's shape."""
+        """Return the action of a network's output, in the observation's shape; PolicyError if it is not finite."""
         if not np.isfinite(x).all():
             raise PolicyError("the policy's output is not a number")
         action = self._output(x, self.low, self.high)

@@ -25,6 +25,6 @@ def shipped(name: str) -> Path:
 
 
 def find_agent(name_or_path: str) -> Path:
-    """Return the file of an agent: a shipped one by its name, or any other."""
+    """Return the file of an agent, by its path or a shipped one's name; ValueError for neither."""
     path = Path(name_or_path)
     return path if path.suffix == ".npz" or path.exists() else shipped(name_or_path)

@@ -96,8 +96,8 @@ def load_plain(path: Path, *, trust: bool = False) -> Any:
     """Return the model of a file of Stable-Baselines3 itself, of any algorithm of its packages.
 
     Raises:
-        CheckpointError: If none of them has the policy's class; UntrustedError without `trust`; MissingPackageError
-            without Stable-Baselines3.
+        CheckpointError: For another file, or one whose policy's class none of them has; UntrustedError without
+            `trust`; MissingPackageError without Stable-Baselines3.
     """
     check_trust(path, trust)
     need("stable_baselines3")

@@ -29,7 +29,9 @@ def open_tuner(agent: str, device: str, trials: int | None, dynamics: str | None
         raise ValueError(f"--trials {trials} must be 1 or more, and {MOST_TRIALS} at most: each turns the motor")
     policy = load_policy(find_agent(agent))
     if policy.bundle.environment != ENVIRONMENT:
-        raise ValueError(f"agent {agent} acts in {policy.bundle.environment}; a tuner acts in {ENVIRONMENT}")
+        raise ValueError(
+            f"agent {agent} acts in {policy.bundle.environment}; a tuner acts in {ENVIRONMENT}; give one of those"
+        )
     known = find_device(device)
     gains_for(policy.bundle.configuration, known)
     check_linear_model(known)

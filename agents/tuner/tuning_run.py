@@ -46,7 +46,7 @@ def finder(policy: Any, doubts: Sequence[str], show: Callable[[TrialShown], None
 
 
 def make_trials(bench: AutoBench, basis: Basis, policy: Any, show: Callable[[TrialShown], None]) -> RecordedGains:
-    """Make the policy's trials; return its answer, and set the start of moves."""
+    """Make the policy's trials, and return its answer; create the proving ground, and reject axes without one."""
     from dataclasses import replace
 
     from agents.tuner.kept_margins import KeptMargins

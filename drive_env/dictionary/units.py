@@ -183,7 +183,7 @@ def find_unit(name: str) -> Unit:
     )
 
 
-def wrap(value: NDArray[Any], bits: int = 32) -> Floats:
-    """Return increments [float] wrapped into the range of a signed counter."""
-    half = 2.0 ** (bits - 1)
+def wrap(value: NDArray[Any]) -> Floats:
+    """Return increments [float] wrapped into the range of a signed counter of 32 bits."""
+    half = 2.0**31
     return np.mod(np.asarray(value, np.float64) + half, 2.0 * half) - half

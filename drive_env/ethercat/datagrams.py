@@ -66,9 +66,9 @@ class Datagram(NamedTuple):
     interrupt: int = 0
 
 
-def at_station(command: int, station: int, offset: int, data: bytes, number: int = 0) -> Datagram:
+def at_station(command: int, station: int, offset: int, data: bytes) -> Datagram:
     """Return a datagram for a station's memory; with auto-increment addresses the first station is 0, the next -1."""
-    return Datagram(command, (station & 0xFFFF) | offset << 16, data, number=number)
+    return Datagram(command, (station & 0xFFFF) | offset << 16, data)
 
 
 def build(datagrams: Sequence[Datagram]) -> bytes:

@@ -15,21 +15,20 @@ class PcapLog:
 
     Args:
         path: The file, which must not exist.
-        epoch: Time of the file at world time 0 [s since 1970].
 
     Raises:
         OSError: If it cannot be created.
     """
 
-    def __init__(self, path: Path, epoch: float = 0.0) -> None:
-        self._epoch, self._path = epoch, path
+    def __init__(self, path: Path) -> None:
+        self._path = path
         self._file = path.open("xb")
         with naming(path):
             self._file.write(struct.pack("<IHHiIII", MAGIC, 2, 4, 0, 0, LARGEST, ETHERNET_LINK))
 
     def add(self, now: float, frame: bytes, _came_back: bool = False) -> None:
         """Write a frame at world time `now` [s]."""
-        seconds, nanoseconds = divmod(round((self._epoch + now) * 1e9), 1_000_000_000)
+        seconds, nanoseconds = divmod(round(now * 1e9), 1_000_000_000)
         with naming(self._path):
             self._file.write(struct.pack("<IIII", seconds, nanoseconds, len(frame), len(frame)) + frame)
 

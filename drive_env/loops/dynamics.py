@@ -30,11 +30,8 @@ DEFAULT = "standard"
 OFF_NOMINAL = 0.4
 INERTIA_RANGE = (0.5, 2.0)  # of the load, over that of the tuning
 WIDEST_RANGE = (0.2, 5.0)
-LOWEST, HIGHEST, POINTS = (
-    1.0,
-    0.49,
-    240,
-)  # frequencies looked at: from [Hz], up to of the velocity loop's rate, how many
+LOWEST, HIGHEST, POINTS = 1.0, 0.49, 240  # frequencies: lowest [Hz], highest over the velocity loop's rate, number
+REGION_POINTS = 181  # of the edge of a region
 NEAR = np.linspace(-3.0, 3.0, 9)  # around a resonance of the closed loops, in half widths
 UNSTABLE = 100.0  # 1/s: a motion that grows at this rate has a clearance of -1
 
@@ -89,11 +86,11 @@ class Dynamics:
         corner = (np.sqrt(np.abs(phase)) + np.sqrt(np.abs(gain))) ** 2
         return gain, phase, np.minimum(corner, self.ms * np.abs(1.0 + L))
 
-    def region(self, count: int = 180) -> tuple[Floats, Floats]:
-        """Return the edge of the region around -1: phase [degrees] from -180 and gain [dB], (count + 1,) each."""
-        around = np.linspace(0.0, 2.0 * math.pi, count + 1)
+    def region(self) -> tuple[Floats, Floats]:
+        """Return the edge of the region around -1: phase [degrees] from -180 and gain [dB], (n,) each."""
+        around = np.linspace(0.0, 2.0 * math.pi, REGION_POINTS)
         phase, gain = np.cos(around) * self.phase_deg, np.sin(around) * self.gain_db
-        inside, outside = np.zeros(count + 1), np.full(count + 1, 3.0)
+        inside, outside = np.zeros(REGION_POINTS), np.full(REGION_POINTS, 3.0)
         for _ in range(40):
             middle = 0.5 * (inside + outside)
             L = -(10.0 ** (middle * gain / 20.0)) * np.exp(1j * np.radians(middle * phase))

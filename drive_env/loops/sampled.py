@@ -330,9 +330,7 @@ def closed_loops(rates: LoopRates, machines: LinearMachines, gains: CascadeGains
     return ClosedLoops(A, B, place)
 
 
-def step_overshoot(
-    rates: LoopRates, closed: ClosedLoops, duration: float = 0.3, growth: Floats | None = None
-) -> Floats:
+def step_overshoot(rates: LoopRates, closed: ClosedLoops, growth: Floats | None = None) -> Floats:
     """Return the overshoot of each axis after a step of its set-point in csp, over the step, (machines, axes).
 
     The larger of two steps counts: of its own set-point alone, and of all axes together, as a gantry moves, whose
@@ -342,11 +340,10 @@ def step_overshoot(
     Args:
         rates: The drive's rates.
         closed: The machines.
-        duration: Time to evaluate [s].
         growth: `closed.growth`, computed by default.
     """
     cycle = round(rates.velocity_rate / rates.communication_rate)
-    (count, states, axes), cycles = closed.B.shape, round(duration * rates.communication_rate)
+    (count, states, axes), cycles = closed.B.shape, round(STEP_TIME * rates.communication_rate)
     A, ramp, constant = np.broadcast_to(np.eye(states), closed.A.shape), 0.0 * closed.B, 0.0 * closed.B
     for k in range(cycle):
         ramp = closed.A @ ramp + closed.B * (k + 1) / cycle
@@ -367,4 +364,5 @@ def step_overshoot(
     return np.where(stable & np.isfinite(most), np.maximum(most - 1.0, 0.0), np.inf)
 
 
+STEP_TIME = 0.3  # s after a step, in which the overshoot is looked for
 STILL = 1e-7  # per window: a motion that grows by less stands still

@@ -125,10 +125,10 @@ def points(x: ArrayLike, y: ArrayLike) -> list[list[float | None]]:
     ]
 
 
-def chart(label: str, name: str, height: str = "clamp(280px, 42vh, 560px)") -> ui.echart:
+def chart(label: str, name: str) -> ui.echart:
     """Return an empty chart; `label` is its description for screen readers, `name` is used in tests."""
     made = ui.echart(options([ChartPanel("")], "", []), renderer="svg")
-    made.classes("studio-chart w-full").style(f"height: {height}")
+    made.classes("studio-chart w-full").style("height: clamp(280px, 42vh, 560px)")
     made.props(f'role="img" aria-label="{label}" data-test="{name}"')
     return made
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 MotionJob = Callable[[Drives], None]
 AxisNumbers = int | Sequence[int]
 
-LONGEST_MOVE = 600.0  # s
+LONGEST_MOVE, LONGEST_STOP = 600.0, 5.0  # s
 
 
 def masks_of(num_axes: int, axes: AxisNumbers) -> Mask:
@@ -224,10 +224,10 @@ def _enabled(drives: Drives, where: Mask) -> Mask:
     return np.asarray(where & cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED))
 
 
-def _await_rest(drives: Drives, where: Mask, timeout: float = 5.0) -> None:
+def _await_rest(drives: Drives, where: Mask) -> None:
     """Let time pass until the quick stop of axes is complete, or they have left its state."""
     waited = 0.0
-    while waited < timeout and motion.is_turning(drives, where, 0.02):
+    while waited < LONGEST_STOP and motion.is_turning(drives, where, 0.02):
         waited += 0.02
         if not np.any(where & cia402.is_live(drives.read(cia402.STATUSWORD))):
             return

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from rigs.process_image import ProcessImage
 
 from drive_env import EmulatedDrives, ObjectAccessError, motion
 from drive_env.dictionary.aborts import (
@@ -15,7 +16,6 @@ from drive_env.dictionary.aborts import (
     VALUE_TOO_HIGH,
     WRONG_STATE,
 )
-from drive_env.node.process_image import ProcessImage
 
 # Tables 22 and 24; entry 2 of the second is printed 60640008h, and 6064h has 32 bits.
 OUTPUTS = """

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from rigs import ROOT
 from rigs.canopen_wire import Wire
+from rigs.process_image import ProcessImage
 from rigs.tables import every_row
 from rigs.tgz_images import SIZES, rows, structure
 
@@ -19,7 +20,6 @@ from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count, to_counts
 from drive_env.drives.speeds import per_increment
 from drive_env.firmware.record import get_lanes
-from drive_env.node.process_image import ProcessImage
 
 REMOTE = 0x0200
 ENABLED, FAULT = (0x6F, 0x27), (0x4F, 0x08)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from rigs import ROOT
 from rigs.canopen_wire import Wire
+from rigs.process_image import ProcessImage
 from rigs.tables import every_row
 from rigs.world_bus import on_bus
 
@@ -22,7 +23,6 @@ from drive_env.dictionary.aborts import READ_ONLY, VALUE_RANGE, VALUE_TOO_HIGH, 
 from drive_env.dictionary.roles import Role
 from drive_env.emulator.inertia_check import MisfitWarning
 from drive_env.motors import MOTORS
-from drive_env.node.process_image import ProcessImage
 from mechanics.loads import find_load
 
 AXES = 3

@@ -250,7 +250,7 @@ def test_ctrl_c_leaves_what_is_complete(tmp_path, monkeypatch):
 
 def test_another_benchmark_is_not_mixed_in(benchmark):
     found = run("--task", TASK, "--seeds", 2, "--steps", 32, "--out", benchmark, "--resume")
-    assert found.exit_code == 2 and "is of hyper-parameters other than are asked for now" in found.output
+    assert found.exit_code == 2 and "was made with other hyper-parameters than this run has" in found.output
 
 
 @pytest.mark.slow

@@ -140,7 +140,6 @@ def compare(
     tuners: Mapping[str, Tuner],
     *,
     seed: int = 0,
-    num_threads: int | None = None,
     log: ShardLog | None = None,
     progress: Progress = lambda what, share: None,
     pool: Pool | None = None,
@@ -154,7 +153,6 @@ def compare(
         machines: The machines of the suite.
         tuners: Tuners by name.
         seed: Seed of the tuners; the same machines and tuner get the same random numbers, whatever else is compared.
-        num_threads: As in `EmulatedDrives`.
         log: Log with the finished rows of an earlier run, to which new ones are added.
         progress: Called with the present action and the share that is done.
         pool: Processes that run the tasks, with identical results; they look tuners up by name, `trials` and
@@ -163,7 +161,7 @@ def compare(
         oracles: Oracles of the machines by name; searched by default.
         dynamics: Requirements on the loops by which gains are judged.
     """
-    best = find_oracles(machines, num_threads, dynamics=dynamics) if oracles is None else oracles
+    best = find_oracles(machines, dynamics=dynamics) if oracles is None else oracles
     kinds = [[machines[index] for index in indices] for indices in groups(machines)]
     tasks = [
         _Task(group, [best[machine.name] for machine in group], seed, dynamics, name, trials)
@@ -175,7 +173,7 @@ def compare(
     def say(task: _Task) -> None:
         progress(f"{task.tuner} on {task.group[0].load}, {task.group[0].motor}", len(done) / len(tasks))
 
-    fresh = _here(tasks, left, tuners, num_threads, say) if pool is None else _elsewhere(tasks, left, pool, say)
+    fresh = _here(tasks, left, tuners, say) if pool is None else _elsewhere(tasks, left, pool, say)
     for k, rows in fresh:
         done[k] = rows
         if log is not None:
@@ -219,16 +217,14 @@ Fresh = Iterator[tuple[int, list[MachineRow]]]  # number of a task, and its rows
 Say = Callable[[_Task], None]  # called with a task that begins, or that a pool has finished
 
 
-def _here(
-    tasks: Sequence[_Task], left: Sequence[int], tuners: Mapping[str, Tuner], num_threads: int | None, say: Say
-) -> Fresh:
+def _here(tasks: Sequence[_Task], left: Sequence[int], tuners: Mapping[str, Tuner], say: Say) -> Fresh:
     """Run tasks one after the other; the bench of a group is shared by consecutive tasks."""
     with ExitStack() as open_now:
         bench: _Bench | None = None
         for k in left:
             if bench is None or bench.task.group is not tasks[k].group:
                 open_now.close()
-                bench = open_now.enter_context(closing(_Bench(tasks[k], num_threads)))
+                bench = open_now.enter_context(closing(_Bench(tasks[k], None)))
             say(tasks[k])
             yield k, bench.rows(tasks[k].tuner, tuners[tasks[k].tuner])
 

@@ -30,9 +30,7 @@ class PredictedStep(NamedTuple):
     position: Floats
 
 
-def predicted_step(
-    measured: MeasuredLoop, gains: Sequence[int] | Integers, axis: int = 0, shown: float = SHOWN
-) -> PredictedStep | None:
+def predicted_step(measured: MeasuredLoop, gains: Sequence[int] | Integers, axis: int = 0) -> PredictedStep | None:
     """Predict the step with gains; None if a loop would be unstable.
 
     At lines that are not trusted, and beyond the measured frequencies, the fitted model is used.
@@ -41,14 +39,13 @@ def predicted_step(
         measured: The velocity loop, with a good fit.
         gains: Raw gains, shape (count,).
         axis: Number of the axis.
-        shown: Duration [s].
     """
     rate = measured.device.velocity_rate
     whole = measured.extended(np.arange(1, round(rate * LINES / 2.0)) / LINES, axis)
     then, now = (whole.loops(row, axis, refined=False) for row in (measured.gains[axis], gains))
     if not all(is_as_stable(before, after) for before, after in zip(then[1:3], now[1:3], strict=True)):
         return None
-    count = round(rate * shown)
+    count = round(rate * SHOWN)
     return PredictedStep(np.arange(count) / rate, _step(now.velocity)[:count], _step(now.position)[:count])
 
 

@@ -62,7 +62,7 @@ def load(
         section: A section of the file whose entries replace those of the preset, e.g. of a load.
 
     Raises:
-        HyperparameterError: If there is no such file or section, or it cannot be read.
+        HyperparameterError: For an unknown preset, file or section, a file that cannot be read, or a wrong value.
     """
     task = environment_name(environment)
     name = environment_of(task)
@@ -104,7 +104,7 @@ def sections(environment: str, algorithm: str, path: str | Path | None = None) -
 
 
 def merge(found: dict[str, Any], others: Mapping[str, Any]) -> None:
-    """Replace entries by others; the entries of tables are replaced one by one."""
+    """Merge other entries into those found, tables within tables, too."""
     for key, value in others.items():
         if isinstance(value, Mapping) and isinstance(found.get(key), dict):
             merge(found[key], value)
@@ -138,7 +138,7 @@ def read_value(value: Any) -> Any:
 
 
 def schedule(value: Any) -> Any:
-    """Return a constant, or RL-Zoo's "lin_3e-4": a function that falls from it to 0 over the run."""
+    """Return a value, or for RL-Zoo's "lin_3e-4" its schedule; HyperparameterError for "lin_" without a number."""
     if isinstance(value, str) and value.startswith("lin_"):
         try:
             first = float(value[4:])

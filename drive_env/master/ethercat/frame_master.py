@@ -205,14 +205,14 @@ class FrameMaster:
         self._repeats[position] = False
         self._to(position, AlState.PRE_OP)
 
-    def _to(self, position: int, state: AlState, timeout: float = PATIENCE) -> None:
+    def _to(self, position: int, state: AlState) -> None:
         """Acknowledge a slave's last error and take it to a state.
 
         Raises:
             BusError: If it refuses, with its AL status code; NoAnswerError if it does not answer.
         """
         self._write(position, registers.AL_CONTROL, struct.pack("<H", state | ACKNOWLEDGE))
-        deadline = time.monotonic() + timeout
+        deadline = time.monotonic() + PATIENCE
         while True:
             status = _status(self._read(position, registers.AL_STATUS, 6))
             if status.state == state and not status.has_error:

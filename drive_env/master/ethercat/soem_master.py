@@ -134,9 +134,9 @@ class SoemMaster:
             slave.write_state()
         self._await(position, state)
 
-    def _await(self, position: int, state: AlState, timeout: float = PATIENCE) -> None:
+    def _await(self, position: int, state: AlState) -> None:
         """Wait until a slave is in a state; BusError if it refuses or does not reach it."""
-        deadline = time.monotonic() + timeout
+        deadline = time.monotonic() + PATIENCE
         while True:
             status = self.status(position)
             if status.state == state and not status.has_error:
