@@ -119,7 +119,9 @@ def resolve(load: Load) -> Load:
 def _gears(load: Load, model: mujoco.MjModel, joints: tuple[str, ...]) -> tuple[float, ...]:
     """Return the gear of each axis; ValueError for one that turns nothing, with its place in the file."""
     if isinstance(load.gear, tuple) and len(load.gear) != len(joints):
-        raise ValueError(f"load {load.name!r} has {len(joints)} driven joints and {len(load.gear)} gears")
+        raise ValueError(
+            f"load {load.name!r} has {len(joints)} driven joints and {len(load.gear)} gears; give one each"
+        )
     gears = load.gear if isinstance(load.gear, tuple) else (float(load.gear),) * len(joints)
     of_actuators = not load.joints and load.gear == 1.0
     if of_actuators:
@@ -556,8 +558,7 @@ def _bits(model: mujoco.MjModel) -> int:
     bits = used.bit_length()
     if bits > CONTACT_BITS // 8:
         raise ValueError(
-            f"the model uses contact bit {bits - 1}; copies of it are distinguished by contact bits, so that it may "
-            f"use "
+            f"the model uses contact bit {bits - 1}; contact bits distinguish copies of it, so that it may use "
             f"bits 0 to {CONTACT_BITS // 8 - 1} of contype and conaffinity only"
         )
     return bits

@@ -253,8 +253,8 @@ def mechanics_window(records, plant, rates, motion):
 
 
 @stage
-def meet(records, plant):
-    """Once per millisecond: move the brakes, and update the rotors' inertia where it varies."""
+def update_brakes_and_inertia(records, plant):
+    """Once per supervision period: move the brakes, and update the rotors' inertia where it varies."""
     axes, copies = plant.jam.shape
     held, jam, mass, varying = plant.brake, plant.jam, plant.mass, plant.varying
     for copy in range(copies):
@@ -479,7 +479,7 @@ def _run_group(play_row: Stage, supervise: Stage, window: Stage, leave_diverged:
             for _ in range(rates.periods):
                 for block in range(records.shape[0]):
                     supervise(records[block], rates)
-                meet(records, plant)
+                update_brakes_and_inertia(records, plant)
                 for _ in range(rates.windows):
                     for block in range(records.shape[0]):
                         window(records[block], rates)

@@ -101,7 +101,7 @@ class KernelFiles:
             _remove(beside)
 
     def flush(self) -> None:
-        """Forget the saved kernels."""
+        """Delete the function's kernels from the disk."""
         for path in self._folder.glob(f"{self._name}.*.kernel"):
             _remove(path)
 

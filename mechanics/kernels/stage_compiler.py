@@ -118,7 +118,7 @@ class _BlockCopies:
         self._memo: dict[int, Any] = {}
 
     def deepcopy(self, one: Any) -> Any:
-        """Copy; a block that is copied again belongs to another copy of its function."""
+        """Copy; blocks share copied variables until one comes again, which begins another copy of the function."""
         if not isinstance(one, ir.Block):
             return copy.deepcopy(one)
         if one.scope is not self._scope or id(one) in self._memo:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from drive_env.firmware.cycle import mechanics_window, meet
+from drive_env.firmware.cycle import mechanics_window, update_brakes_and_inertia
 from drive_env.firmware.record import LANES
 from drive_env.firmware.servo.stages import FIRMWARE
 from mechanics.kernels.compiled import cached
@@ -31,7 +31,7 @@ def run_cycle(records, plant, rates, scratch, num_axes, sums, change):
     sums[:] = 0.0
     for block in range(records.shape[0]):
         supervise(records[block], rates)
-    meet(records, plant)
+    update_brakes_and_inertia(records, plant)
     for _ in range(rates.windows):
         for axis in range(num_axes):
             theta[axis] = records[axis // LANES].theta_m[axis % LANES]

@@ -6,7 +6,7 @@ from mechanics.kernels.compiled import stage
 
 LEFT, RIGHT, HOME, ENABLE = 1, 2, 4, 8
 
-# 2005h (table 58): bit that deactivates and bit that inverts each switch, in the order left, right, home.
+# 2005h (TMCM-1636 manual, table 58): bits that deactivate and that invert the switches, in the order left, right, home.
 _DEACTIVATE = (0x01, 0x02, 0x10)
 _INVERT = (0x04, 0x08, 0x20)
 

@@ -75,7 +75,7 @@ def overload(drive, lane, told):
     return drive.overload[lane] > 1.0
 
 
-# Status flags are those of 2101h (table 85).
+# Status flags are those of 2101h (TMCM-1636 manual, table 85).
 CAUSES = (
     Cause(FAULT_RESET, WARN, 0x00, 0x0),
     Cause("overcurrent_high_side", CUT, 0x02, 0x1, overcurrent_high_side, held=True),

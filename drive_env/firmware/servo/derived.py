@@ -1,4 +1,4 @@
-"""Quotients that the ticks need, computed once per millisecond: a division costs a tick as much as ten products."""
+"""Quotients that the ticks need, once per supervision period: a division costs a tick as much as ten products."""
 
 from __future__ import annotations
 

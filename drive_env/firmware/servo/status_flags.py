@@ -1,4 +1,4 @@
-"""The status flags of 2101h (table 85)."""
+"""The status flags of 2101h (TMCM-1636 manual, table 85)."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from drive_env import cia402
 from drive_env.firmware.common import fsa, start_up
 from mechanics.kernels.compiled import stage
 
-# Bits of 2101h (table 85); the faults' bits are set by the protection.
+# Bits of 2101h; the faults' bits are set by the protection.
 FLAG_HALTED, FLAG_STOP, FLAG_VELOCITY, FLAG_POSITION, FLAG_TORQUE = 1 << 4, 1 << 8, 1 << 9, 1 << 10, 1 << 11
 FLAG_POSITION_END, FLAG_INITIALIZED, FLAG_BRAKE = 1 << 14, 1 << 15, 1 << 18
 

@@ -1,4 +1,4 @@
-"""Temperatures of winding and stage, once per millisecond: copper loss warms, and changes resistance and flux."""
+"""Temperatures of winding and stage in each supervision period, by copper loss; they change resistance and flux."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ def pressed(drive, lane):
 
 @stage
 def read_module_inputs(drive, rates):
-    """Write the levels of the inputs of each axis' module: digital_inputs, and 60FDh."""
+    """Write the levels of the module's inputs, digital_inputs and 60FDh, and those of each axis, axis_inputs."""
     for lane in range(LANES):
         first = owner(drive, lane)
         levels = drive.inputs_set[first] | pressed(drive, first)

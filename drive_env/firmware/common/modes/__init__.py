@@ -253,12 +253,12 @@ def generate_demand(drive, lane, dt):
         drive.braking[lane] = 0
         follow(drive, lane, mode, dt)
     if mode in (CSP, CSV, CST):
-        drive.target_reached[lane] = 0  # bit 10 is reserved in these modes (tables 237, 263, 283)
+        drive.target_reached[lane] = 0  # bit 10 is reserved in these modes
 
 
 @stage
 def mode_bits(drive, lane):
-    """Return bit 12 of the statusword with its meaning in the present mode (tables 148, 217, 237, 263, 283)."""
+    """Return bit 12 of the statusword of the present mode (TMCM-1636 manual, tables 148, 217, 237, 263, 283)."""
     mode = acts_as(drive.mode_display[lane])
     bits = 0
     if mode == PP:
