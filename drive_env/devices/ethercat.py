@@ -125,7 +125,7 @@ class EtherCatBehaviour(NamedTuple):
 
 
 def ethercat_of(data: Mapping[str, Any] | None) -> EtherCatBehaviour | None:
-    """Return the table `ethercat` of a device's data; ValueError for an invalid key or value."""
+    """Return a device's table `ethercat`, None for None; ValueError for an invalid key or value."""
     if data is None:
         return None
     fields = EtherCatBehaviour._fields

@@ -75,7 +75,7 @@ RUN, STANDBY = ("current", "amplitude"), ("current", "standby amplitude")  # of 
 class GainSet:
     """The gains of a device, in its order; raw integers have shape (..., count).
 
-    cascade: Structure of their loops, one of those in `drive_env/devices/gains.py`, which have a rule; "" if unknown.
+    cascade: Structure of the loops, by its name in `drive_env/devices/gains.py`; "" for one without gains by rule.
     closed_loops: The loops that a stepper's drive may close.
     """
 
@@ -211,8 +211,8 @@ class GainSet:
 
         Args:
             raw: The gains.
-            by: The change, shape (..., len(columns)): the logarithm of the factor by which a gain acts more; in units
-                of `PER_UNIT` for settings of which 0 is an ordinary value.
+            by: The change, shape (..., len(columns)): the logarithm of the factor by which a gain acts more; for a
+                setting that may be 0 the number of its steps, over those of `PER_UNIT`.
             columns: The gains to change.
             highest: Greatest integers of all gains.
         """

@@ -158,7 +158,7 @@ class _Reader:
         self._unread: list[tuple[str, str]] = []
 
     def device(self, product: str) -> VendorEsi:
-        """Return the device that a text selects; the only one for an empty text."""
+        """Return the device that a text selects, the only one for ""; ValueError for none, or an unfit one."""
         maker = self._root.find("Vendor")
         if maker is None:
             raise ValueError("it has no <Vendor>, by which masters know a device; add one with its Id")

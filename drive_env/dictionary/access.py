@@ -70,7 +70,7 @@ def checked_values(entry: Entry, value: Any, num_axes: int) -> Integers:
 
 
 def _as_array(value: Any) -> NDArray[Any]:
-    """Return the value as an array; of dtype object if it is not numbers."""
+    """Return the value as an array; for rows of different lengths one without numbers."""
     try:
         return np.asarray(value)
     except ValueError:

@@ -123,7 +123,7 @@ def place_of_line(line: str) -> tuple[int, int] | None:
 
 
 def _section_of(line: str) -> tuple[str, bool] | None:
-    """Return the name of the section that a line begins, and whether its bracket is closed."""
+    """Return the name of the section that a line begins, and whether its bracket is closed; None for other lines."""
     line = line.strip()
     name, is_closed, _ = line[1:].partition("]")
     return (name.strip(), bool(is_closed)) if line.startswith("[") else None

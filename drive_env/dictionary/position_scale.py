@@ -70,7 +70,7 @@ def velocity_ratio(roles: Mapping[Role, Key]) -> PositionScale | None:
 
 
 def set_point_ratio(roles: Mapping[Role, Key]) -> PositionScale | None:
-    """Return the same for the velocity units of a target velocity of vl (604Bh)."""
+    """Return the same for the velocity units of a target velocity of vl (604Bh); None without 604Bh."""
     return _ratio(roles, (Role.SET_POINT_NUMERATOR, Role.SET_POINT_DIVISOR))
 
 

@@ -99,7 +99,7 @@ class ChosenAxes(DrivesProxy):
         return np.asarray(self._drives.read(name)[self._axes])
 
     def write(self, name: ObjectName, value: ArrayLike, where: Mask | None = None) -> None:
-        """Write an object of every chosen axis, or of some of them."""
+        """Write an object of every chosen axis, or of some; ValueError for another number of values than axes."""
         mask = self._of_all(where)
         if isinstance(value, str) or np.ndim(value) == 0:
             self._drives.write(name, value, where=mask)
@@ -137,7 +137,7 @@ class ChosenAxes(DrivesProxy):
         return [message._replace(axis=place[message.axis]) for message in told if message.axis in place]
 
     def reset_node(self, where: Mask | None = None) -> None:
-        """Refuse: a node restarts with all of its axes."""
+        """Raise ValueError: a node restarts with all of its axes."""
         raise ValueError("a node is reset with all its axes, and some are left out here; open it with all of them")
 
     def start_node(self, where: Mask | None = None) -> None:

@@ -177,11 +177,11 @@ class Drives(BasicDrives, Protocol):
 
     @property
     def machine(self) -> MachineSide | None:
-        """The emulated machines' side that no bus shows."""
+        """The emulated machines' side that no bus shows; None on a bus, or where an observer hides it."""
 
     @property
     def bus(self) -> BusSide | None:
-        """The drives of a bus: its nodes, frames and single axes; axis k of these is its axis `axis_numbers[k]`."""
+        """The drives of a bus, whose axis `axis_numbers[k]` is axis k of these; None for emulated drives."""
 
     @property
     def safety(self) -> SafetyWatch | None:
@@ -251,7 +251,7 @@ def machine_of(drives: Drives) -> MachineSide:
 def bus_of(drives: Drives) -> BusSide:
     """Return the drives of a bus; ValueError for emulated ones."""
     if drives.bus is None:
-        raise ValueError("these drives are not on a bus; use CanDrives")
+        raise ValueError("these drives are not on a bus; use open_drives")
     return drives.bus
 
 

@@ -100,7 +100,7 @@ def _why_not_heard(drives: BasicDrives, status: int) -> str:
 
 
 def select_mode(drives: BasicDrives, mode: str, where: Mask | None = None) -> None:
-    """Select a mode of operation by abbreviation on the axes that are not in it yet.
+    """Select a mode of operation by abbreviation on the axes not in it yet; ValueError for an unknown one.
 
     An enabled axis keeps its position: the mode's target is written first, as by `stay`. If the drive has a
     manufacturer's mode that must match, that is written, too. On a bus the drive may see one mode without the other and
@@ -557,7 +557,7 @@ def home(drives: BasicDrives, where: Mask | None = None, timeout: float = 60.0) 
 
 
 def _await_home(drives: BasicDrives, axes: Mask, timeout: float) -> None:
-    """Let time pass until the axes have completed homing."""
+    """Let time pass until axes have homed; RuntimeError if one fails, TimeoutError after `timeout` [s]."""
     waited, silent = 0.0, 0
     while True:
         drives.advance(2 * CYCLE)  # the first look must come after the drive has begun

@@ -31,7 +31,7 @@ class ObservedDrives(DrivesProxy):
 
     @property
     def machine(self) -> MachineSide | None:
-        """The emulated machines' side, unless an observer hides it."""
+        """The emulated machines' side; None on a bus, or if an observer hides it."""
         return None if any(observer.hides_machine for observer in self._observers) else self._drives.machine
 
     @property

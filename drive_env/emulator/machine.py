@@ -377,7 +377,7 @@ class Machines:
         """Forced errors, independent of machine and drive, shape (num_axes,); bit k is error k of the table.
 
         Can be set; errors with a physical cause here occur by that, too. ValueError for a bit without an error, and for
-        drives whose errors have no numbers.
+        drives without such bits.
         """
         self._check_has_errors()
         return self._axis_field(ERRORS_FIELD).astype(np.int64)
@@ -398,7 +398,9 @@ class Machines:
     def _check_has_errors(self) -> None:
         device = self.inside.device
         if not device.firmware.layout.has(ERRORS_FIELD):
-            raise ValueError(f"errors of {device.name} have no numbers; make them by what causes them")
+            raise ValueError(
+                f"{device.name} has no error bits to set; inject a fault that causes the error (machine.fault)"
+            )
 
     @property
     def leds(self) -> tuple[NDArray[np.str_], NDArray[np.str_]]:
@@ -530,7 +532,7 @@ class Machines:
         self._faults.clear(number, self._mask(where))
 
     def seed_noise(self, seeds: ArrayLike, where: Mask | None = None) -> None:
-        """Set noise seeds of machines, from their next reset on: whole numbers 1...2^32 - 1, shape (num_machines,)."""
+        """Set noise seeds of machines, from their next reset on: 1...2^32 - 1, (num_machines,), else ValueError."""
         mask = self._mask(where)
         chosen = np.asarray(seeds, float)
         if chosen.shape != mask.shape or np.any((chosen < 1.0) | (chosen >= 2.0**32)):

@@ -115,7 +115,7 @@ class MachineFaults:
 
     # --- giving, listing, taking back -----------------------------------------------------------------------------
     def add(self, order: Order, machines: Mask, of_node: Mask | None = None) -> int:
-        """Schedule a fault and return its number; `Machines.fault` explains an order.
+        """Schedule a fault and return its number; `Machines.fault` explains an order and its errors.
 
         Args:
             order: The fault.

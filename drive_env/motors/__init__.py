@@ -260,7 +260,7 @@ def check_kind(kind: object) -> None:
 
 
 def motor_of(name: str, data: Mapping[str, Any]) -> Motor:
-    """Return the motor of a file's tables."""
+    """Return the motor of a file's tables; MotorError for a missing, unknown or impossible entry."""
     unknown = sorted(set(data) - {"title", "kind", "sources", "numbers", "pull_out"})
     if unknown:
         raise MotorError(f"{unknown[0]!r} is not a key of a motor; there are title, kind, sources, numbers, pull_out")
@@ -361,7 +361,7 @@ def _built(name: str, title: str, kind: str, values: Mapping[str, float], source
 def _stepper(
     name: str, title: str, values: Mapping[str, float], sources: Mapping[str, str], curve: PullOut | None
 ) -> Motor:
-    """Return the stepper of checked numbers; its class values are from data sheets that have them."""
+    """Return a stepper from checked numbers and typical ones for those it lacks; MotorError without a needed one."""
     for key in STEPPER_NEEDED:
         _one_of((key,), values)
     _refuse(

@@ -200,7 +200,7 @@ class Axis:
         return read
 
     def _part_reader(self, entry: Entry) -> Callable[[], int | str]:
-        """Return a reader of a part of another object, equal to `LiveDictionary.part` for all axes."""
+        """Return a reader of an object that shows a part of another one (`parts` of the device)."""
         part, within = self._device.parts[entry.index, entry.sub], self.number % self._device.num_axes
         source = self.number if part.axis is None else self.number - within + part.axis
         if source >= self._objects.num_axes or (part.axis or 0) >= self._device.num_axes:

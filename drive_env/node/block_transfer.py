@@ -155,7 +155,7 @@ class BlockUpload:
         return bytes((self._sent | (LAST if is_last else 0),)) + part.ljust(SEGMENT, b"\0")
 
     def request(self, data: bytes) -> bytes | None:
-        """Handle the client's start or acknowledgement; return the response, if there is one.
+        """Handle the client's start or acknowledgement; return the response, None if segments follow.
 
         Raises:
             ObjectAccessError: 05040001h, 05040002h or 05040003h.

@@ -44,7 +44,7 @@ class PackedFields:
         return self._fields.write(self._received.unpack(data))
 
     def _port(self, field: ImageField) -> ObjectPort | None:
-        """Return the port of a field's object; it ignores writes while the field is not in use."""
+        """Return the port of a field's object, None for a gap; it ignores writes while the field is not in use."""
         if field.key is None:
             return None
         port = self._find(*field.key)

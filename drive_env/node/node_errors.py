@@ -91,7 +91,7 @@ class NodeErrors:
         self.conditions.clear()
 
     def register(self, without: Axis | None = None) -> int:
-        """Return 1001h: the errors of the axes and of the node's communication."""
+        """Return 1001h: the errors of the axes, except `without`, and of the node's communication."""
         register = 0
         for number, axis in enumerate(self._axes):
             if axis is not without:

@@ -84,7 +84,7 @@ class SdoServer:
         }
 
     def request(self, data: bytes, now: float) -> bytes | None:
-        """Return the response to a request received at `now` [s]; frames of other than 8 bytes are ignored."""
+        """Return the response to a request received at `now` [s]; None without, as for a frame not of 8 bytes."""
         if len(data) != 8:
             return None
         specifier = data[0] >> 5

@@ -88,5 +88,5 @@ def test_an_observer_may_hide_the_machine_and_nothing_else(drives):
     assert [observer.name for observer in hidden.observers] == ["a", "b"]
     with pytest.raises(ValueError, match="these drives have no emulated machine; use EmulatedDrives"):
         machine_of(hidden)
-    with pytest.raises(ValueError, match="these drives are not on a bus; use CanDrives"):
+    with pytest.raises(ValueError, match="these drives are not on a bus; use open_drives"):
         bus_of(hidden)
