@@ -222,7 +222,7 @@ class BusFaults:
             fault.inner = self._give_to_machine(fault, node)
 
     def _give_to_machine(self, fault: _BusFault, number: int) -> int:
-        """Pass a fault to the machines of a node: for the given axis, or by default for all axes concerned.
+        """Pass a fault to a node's machines, for one axis or by default for all concerned; return its number there.
 
         By default faults of sensors, motor and supply concern the node's own axes, those of the load all axes of its
         machines.

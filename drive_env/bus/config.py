@@ -17,7 +17,7 @@ from mechanics.reading.untrusted import read_toml
 if TYPE_CHECKING:  # MuJoCo takes long to import
     from drive_env.emulator.emulated_drives import EmulatedDrives
 
-NO_MOTOR = "none"  # for a machine that always has a motor
+NO_MOTOR = "none"  # refused with a remedy: every machine has a motor
 
 
 class BusConfigError(ValueError):
@@ -160,7 +160,7 @@ def check_seed(bus: Bus) -> None:
 
 
 def store_folder(bus: Bus) -> Path | None:
-    """Return the folder of the nodes' stores, made if it was missing; None if nodes keep them in memory."""
+    """Return the folder of the nodes' stores, made if missing (else BusConfigError); None if they are in memory."""
     if bus.store is None:
         return None
     path = Path(bus.store)

@@ -174,7 +174,7 @@ class World:
         return f" ({elsewhere} of them on EtherCAT)" if elsewhere else ""
 
     def attach(self, node_id: int, make: Callable[[Callable[[Frame], None]], BusNode]) -> None:
-        """Put a node on the bus; `make` builds it from the function by which it sends."""
+        """Put a node on the bus, built by `make` from the function by which it sends; ValueError for a used node-ID."""
         if not 1 <= node_id <= MAX_NODE_ID:
             raise ValueError(f"node {node_id} is out of range; identifiers are 1 to {MAX_NODE_ID}")
         if node_id in self.nodes:

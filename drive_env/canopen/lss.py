@@ -83,7 +83,7 @@ class LssNode(Protocol):
         """Fall silent, switch to the bit rate after `delay` [s], and stay silent for `delay` again."""
 
     def store(self) -> int:
-        """Store the pending settings; return the error code."""
+        """Store the pending settings; return OK, STORE_UNSUPPORTED or STORE_FAILED."""
 
     def leave_configuration(self) -> None:
         """Note that the slave waits again: a node that had no node-ID and now has one boots."""
@@ -148,7 +148,7 @@ class LssSlave:
             self._node.leave_configuration()
 
     def _switch_selective(self, part: int, number: int) -> bytes | None:
-        """Compare a part of the identity; the slave is selected if all four match in their order."""
+        """Compare a part of the identity; select the slave and answer if all four match in their order, else None."""
         if self.is_configuring:
             return None
         in_order = part in (0, self._switch_stage)
@@ -160,7 +160,7 @@ class LssSlave:
         return _answer(Service.SWITCHED)
 
     def _identify(self, part: int, number: int) -> bytes | None:
-        """Compare vendor and product, and the ranges of revision and serial number."""
+        """Compare vendor and product, and the ranges of revision and serial number; answer if all fit, else None."""
         identity = self._node.identity()
         fits = (
             number == identity.vendor,
@@ -181,7 +181,7 @@ class LssSlave:
         return self._node.active_node_id() == UNCONFIGURED and self._node.pending_node_id() == UNCONFIGURED
 
     def _scan(self, number: int, bit: int, part: int, following: int) -> bytes | None:
-        """Answer if the identity's bits down to `bit` equal those of the number."""
+        """Answer if the identity's bits down to `bit` equal those of the number, else None."""
         if self.is_configuring or not self._is_unconfigured():
             return None
         if bit == FASTSCAN_BEGINS:

@@ -793,7 +793,7 @@ class Node:
         self._take_bit_rate("by LSS")
 
     def store(self) -> int:
-        """Store the pending node-ID and bit rate."""
+        """Store the pending node-ID and bit rate; return an error code of `lss`, OK if all went well."""
         services = self._device.canopen.services
         if not services.lss_stores:
             return lss.STORE_UNSUPPORTED

@@ -144,7 +144,7 @@ class DistributedClock:
         return None if pulse is None else self._world_time(pulse)
 
     def take_pulse(self, now: int) -> tuple[int, int] | None:
-        """Return the pulse due at `now` [ns], SYNC0 or SYNC1, with its world time [ns], and schedule the next."""
+        """Return the pulse due at `now` [ns], SYNC0 or SYNC1, and its world time [ns], or None; schedule the next."""
         if self._sync1_is_first():
             following = self._next_sync1
             if following is None or (self.system(now) - following) % TIMES >= TIMES // 2:

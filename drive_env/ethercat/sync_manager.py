@@ -105,7 +105,7 @@ class SyncManager:
         self._interrupts = INTERRUPT_WRITE
 
     def take(self) -> bytes | None:
-        """Return the bytes written by the master since the last call; this empties a mailbox."""
+        """Return the bytes written by the master since the last call, None without; this empties a mailbox."""
         data, self.written = self.written, None
         if data is not None:
             self.is_full = False

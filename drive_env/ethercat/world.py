@@ -135,7 +135,7 @@ class EtherCatWorld:
 
     # --- inside -----------------------------------------------------------------------------------------------------
     def _after(self, done: bytes | None, start: int) -> bytes | None:
-        """In lockstep, let the time to the next image pass after a frame with process data; return its answer."""
+        """In lockstep, let the time to the next image pass after a frame with process data; return `done`."""
         if done is not None and self.lockstep:
             start = datagrams.begin(done) or start if start else start
             if any(place.command in LOGICAL for place in datagrams.find(done, start) or ()):

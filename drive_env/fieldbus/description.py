@@ -125,7 +125,7 @@ class Description:
     def decode(self, entry: Entry, data: bytes) -> Any:
         """Return the integer, float or text of an object's bytes.
 
-        Surplus bytes of an answer are ignored; too few are an error.
+        Surplus bytes of an answer are ignored; too few raise ObjectAccessError.
         """
         kind = self._types[entry.index, entry.sub].data_type
         if kind in datatypes.INTEGER_TYPES or kind == datatypes.BOOLEAN:

@@ -347,14 +347,14 @@ class BusDrives:
         """Return the client for the objects of a node, by its position in `nodes`."""
         return self._link.sdo(node)
 
-    def write_raw(self, entry: Entry, axis: int, value: int) -> None:
-        """Write an object of one axis, regardless of a lent value."""
+    def write_raw(self, entry: Entry, axis: int, value: int | str) -> None:
+        """Write an object of one axis, even if the envelope has overridden it."""
         node, index, sub, label = self._place_of(entry, axis)
         data = self._description.encode(entry, value)
         self._link.sdo(node).write(index, sub, data, f"{value} to {label}", self._description.patience(entry))
 
     def read_raw(self, entry: Entry, axis: int) -> Any:
-        """Read an object of one axis as the drive has it, even if that value is lent."""
+        """Read an object of one axis as the drive has it, even if the envelope has overridden it."""
         node, index, sub, label = self._place_of(entry, axis)
         data = self._link.sdo(node).read(index, sub, label, self._description.patience(entry))
         return self._description.decode(entry, data)
@@ -377,7 +377,7 @@ class BusDrives:
         return self._cycle_runner.mapped()
 
     def poll(self, watch: CycleWatch) -> bool | None:
-        """Send a SYNC and observe its samples, as `CycleRunner.poll`."""
+        """Send a SYNC and observe its samples; return as `CycleRunner.poll`."""
         return self._cycle_runner.poll(watch)
 
     @property
@@ -401,17 +401,13 @@ class BusDrives:
         return np.array(values, np.int64 if entry.high is None or entry.high < 2**63 else np.uint64)
 
     def read_axis(self, entry: Entry, axis: int) -> Any:
-        """Read an object of one axis; if another value is lent (`Limits`), the program's own."""
+        """Read an object of one axis; of one that the envelope has overridden, the program's value."""
         found = self.read_raw(entry, axis)
         return found if self.safety is None or not isinstance(found, int) else self.safety.own(entry, axis, found)
 
     def write_axis(self, entry: Entry, axis: int, value: int | str) -> None:
-        """Write an object of one axis, past the envelope."""
-        if isinstance(value, str):
-            node, index, sub, label = self._place_of(entry, axis)
-            data = self._description.encode(entry, value)
-            self._link.sdo(node).write(index, sub, data, f"{value} to {label}", self._description.patience(entry))
-        elif self.safety is None or not self.safety.write_lent(entry, axis, value):
+        """Write an object of one axis, past the envelope; of one that it has overridden, store the value."""
+        if isinstance(value, str) or self.safety is None or not self.safety.write_lent(entry, axis, value):
             self.write_raw(entry, axis, value)
 
     def pass_cycle(self) -> None:

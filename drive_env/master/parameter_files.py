@@ -53,7 +53,7 @@ def parameters_text(drives: DescribedAxes, axis: int, values: Mapping[tuple[int,
 
 
 def load_parameters(path: Path, dictionary: ObjectDictionary) -> dict[tuple[int, int], int]:
-    """Read the parameters of a file; ValueError for other files."""
+    """Read the parameters of a file; ValueError for other files, ObjectAccessError for a wrong object or value."""
     rows = _read_toml(path).get("parameters")
     if not isinstance(rows, dict) or not rows:
         raise ValueError(f"{path} has no table [parameters]; `drive-env parameters backup` writes one")

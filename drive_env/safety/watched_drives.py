@@ -87,7 +87,7 @@ class WatchedDrives(Protocol):
         """Read an object of one axis as the drive has it, even if that value is lent."""
 
     def write_raw(self, entry: Entry, axis: int, value: int) -> None:
-        """Write an object of one axis, regardless of a lent value."""
+        """Write an object of one axis, even if the envelope has overridden it."""
 
     def start(self) -> None:
         """Make the nodes operational, so that they exchange process data; once."""

@@ -54,7 +54,7 @@ class SdoChannel(Protocol):
 
 
 def read(channel: SdoChannel, initiated: bytes) -> bytes:
-    """Return the data of an upload whose initiate request was answered.
+    """Return the data of an upload whose initiate request was answered; SdoCommunicationError if it fails.
 
     Args:
         channel: The client.
@@ -122,7 +122,7 @@ def is_download(answer: bytes) -> bool:
 
 
 def write(channel: SdoChannel, initiated: bytes, content: bytes) -> None:
-    """Send the data of a download whose initiate request was answered.
+    """Send the data of a download whose initiate request was answered; SdoCommunicationError if it fails.
 
     Args:
         channel: The client.

@@ -89,7 +89,7 @@ class DrySdoClient:
         return self._values.get((index, sub), b"\0\0\0\0")
 
     def ask(self, index: int, sub: int, timeout: float) -> bytes | None:
-        """Return the bytes that `read` returns."""
+        """Return the bytes that `read` returns, never None."""
         return self.read(index, sub, "", timeout)
 
     def command(self, index: int, sub: int, data: bytes) -> None:

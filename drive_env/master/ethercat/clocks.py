@@ -74,7 +74,7 @@ def start_sync0(master: EtherCatMaster, positions: Sequence[int], clock: Sync0) 
         clock: Its cycle; in lockstep no time passes meanwhile, and the first pulse is that of the next cycle.
 
     Raises:
-        BusError: If a slave's clock does not start.
+        BusError: If a slave's clock does not start; NoAnswerError if the first slave does not answer.
     """
     length = round(clock.cycle / NANOSECOND)
     activation = SYNC0_ON | (SYNC1_ON if clock.sync1 else 0)

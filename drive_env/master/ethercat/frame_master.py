@@ -266,7 +266,7 @@ class FrameMaster:
 
     # --- images -----------------------------------------------------------------------------------------------------
     def map(self, sizes: Mapping[int, ImageSizes]) -> None:
-        """Assign addresses to the images of slaves, and take the slaves from Pre-Op to Safe-Op."""
+        """Assign addresses to images, and take the slaves from Pre-Op to Safe-Op; BusError if images do not fit."""
         self._mapped.clear()
         total = sum(size.outputs + size.inputs for size in sizes.values())
         if total > LONGEST_IMAGE:

@@ -52,7 +52,7 @@ class CallWay:
             self._came.append(done[datagrams.ETHERNET :])
 
     def receive(self, timeout: float) -> bytes | None:
-        """Return a frame that has passed the slaves."""
+        """Return a frame that has passed the slaves, or None."""
         return self._came.pop(0) if self._came else None
 
     def close(self) -> None:

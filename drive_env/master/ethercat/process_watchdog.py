@@ -108,7 +108,7 @@ class ProcessWatchdog:
         return node in self._set
 
     def is_in_force(self, node: int) -> bool:
-        """Ask a node; return whether its watchdog has the time that was set and is active, which it is in Op only."""
+        """Ask a node; return whether watchdog and reaction are as set, and active, which a watchdog is in Op only."""
         position = self._nodes[node]
         has = tuple(self._register(position, address) for address in TIMES) == self._set.get(node)
         return has and self._master.status(position).is_op and self._objects[node].are_in_force()

@@ -80,7 +80,7 @@ class SlaveObjects:
             self.write(index, sub, data, label, timeout)
 
     def ask(self, index: int, sub: int, timeout: float) -> bytes | None:
-        """Return the bytes of a short object if they come within `timeout` [s]."""
+        """Return the bytes of a short object, None if they do not come within `timeout` [s]."""
         with contextlib.suppress(BusError, ObjectAccessError):
             return self._master.upload(self._position, index, sub, timeout)
         return None
