@@ -69,7 +69,7 @@ class Snapshot:
     Attributes:
         device: Name of the device.
         axes: For each axis, (index, sub-index) -> raw integer.
-        bus: Options of `CanDrives` that open the drives again; empty for emulated drives.
+        bus: Options of `open_drives` that open the drives again; empty for emulated drives.
         stored: Whether the drives stored the change; then undoing it is stored, too.
         identities: Identity objects of each node; empty for emulated drives, and if the file lacks them.
         left_out: For each axis that `bus` does not choose, by its number among all axes of the nodes: the values of
@@ -264,7 +264,7 @@ def restore(
     turn with those of an earlier program once it is enabled.
 
     Args:
-        drives: The drives, `EmulatedDrives` or `CanDrives`.
+        drives: The drives, emulated or on a bus.
         snapshot: The state to restore.
         where: Axes to restore; all by default.
         whole: Also restore objects of the communication area, and those that were changed on axes not chosen, whose
@@ -436,7 +436,7 @@ class Transaction:
         self._committed |= True if where is None else where
 
     def roll_back(self, where: Mask | None = None, to: Snapshot | None = None) -> None:
-        """Restore the settings of axes, all by default: the gains immediately, the rest once they are disabled.
+        """Restore the settings of axes, all by default: the gains immediately, the rest after switching them off.
 
         Args:
             where: The axes.
@@ -465,7 +465,7 @@ class Transaction:
 
 
 def switch_off(drives: Drives, where: Mask) -> None:
-    """Switch the voltage off and wait until no axis can turn; one in fault is off after its fault reaction."""
+    """Switch the voltage off and wait until no axis is live, a fault reaction among it; TimeoutError if one is."""
     drives.write(cia402.CONTROLWORD, 0x00, where=where)
     for _ in range(SWITCH_OFF):
         if not np.any(where & [cia402.is_live(int(word)) for word in drives.read(cia402.STATUSWORD)]):

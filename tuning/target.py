@@ -57,7 +57,7 @@ class Target:
     """Drives to tune, and what the user knows of them.
 
     Attributes:
-        drives: `EmulatedDrives` or `CanDrives`.
+        drives: Emulated drives, or drives on a bus.
         device: Device of the drives.
         motor: Data sheet values of the motor, the same for every axis.
         supply: Supply voltage as the user enters it [V], shape (num_axes,).
@@ -70,7 +70,7 @@ class Target:
         linked: Whether the axes of a machine move one rigid thing, as those of a gantry: none may move far without the
             others.
         machine: The emulated load's name, or the channel of the bus.
-        bus: Options of `CanDrives` that open the drives of a bus again; empty for emulated ones.
+        bus: Options of `open_drives` that open the drives of a bus again; empty for emulated ones.
         inputs: The user's own files for device, motor and load, for the certificate.
     """
 
@@ -305,7 +305,7 @@ def on_bus(
         current: Greatest current during excitation [A]; the motor's rated current by default.
         axes: How the nodes' axes are coupled, one of `AXES`; it cannot be read from a bus.
         options: `chosen`, the numbers (from 0) of the axes of each node to tune, all by default (the others are never
-            commanded); and further options of `CanDrives`.
+            commanded); and further options of `open_drives`.
 
     Raises:
         ValueError: For an unknown name, a travel that does not contain 0, or an axis that the device does not have.
@@ -364,7 +364,7 @@ def of_bus(
     Args:
         drives: The drives.
         motor: Motor of every node.
-        address: Options of `CanDrives` that open them again.
+        address: Options of `open_drives` that open them again.
         supply: Supply voltage [V], one value or one per axis; the motor's by default.
         travel: Signed angles that the rotors may turn from their present angle [rad], as in `on_bus`.
         speed: Greatest speed during excitation [rad/s]; the motor's rated speed by default.

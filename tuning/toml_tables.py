@@ -36,14 +36,14 @@ def check_keys(where: str, table: Mapping[str, Any], known: list[str], optional:
 
 
 def as_table(where: str, value: Any) -> dict[str, Any]:
-    """Check that a value is a table and return it."""
+    """Return a table; ExperimentError for another value."""
     if not isinstance(value, dict):
         raise ExperimentError(f"{where} is {kind_of(value)}; it must be a table")
     return value
 
 
 def as_value(where: str, value: Any, kind: str) -> Any:
-    """Check the kind of a value and return it; "float" accepts whole numbers, no kind accepts booleans."""
+    """Return a value of a kind, else ExperimentError; "float" accepts whole numbers, no kind accepts booleans."""
     wanted, meaning = _KINDS[kind]
     if wanted is float and type(value) is int:
         value = float(value)

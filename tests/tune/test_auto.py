@@ -243,7 +243,18 @@ LIVELY, SLOWER = [8009, 9699, 1000, 1600, 1700], [8009, 9699, 900, 900, 700]
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "stage", ["on_twins", "try_gains", "show", "step", "measure", "load", "_corrected", "_try", "look_back"]
+    "stage",
+    [
+        "on_twins",
+        "try_gains",
+        "record_final_move",
+        "step",
+        "measure",
+        "load",
+        "_corrected",
+        "_try",
+        "record_previous_gains",
+    ],
 )
 def test_whatever_ends_it_the_gains_before_are_back(quick_designs, monkeypatch, tmp_path, stage):
     def interrupted(bench, *handed, **named):

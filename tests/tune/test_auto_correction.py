@@ -91,7 +91,7 @@ def corrected(monkeypatch, wanted, *, slack=None, fails=lambda p: False, failed=
         return vary(recorded, overshoot=np.array(every))
 
     monkeypatch.setattr(correction, "design_axes", design_axes)
-    monkeypatch.setattr(correction, "show", verify)
+    monkeypatch.setattr(correction, "record_final_move", verify)
     monkeypatch.setattr(correction, "step", step)
     monkeypatch.setattr(correction, "measure", measure)
     monkeypatch.setattr(correction, "load", lambda bench, basis, recorded, target, where: recorded)

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 # Drive time of the parts [s]: a frequency response of an axis; a trial with recovery; a recorded move; and a recorded
 # move that begins where a response has ended.
-RESPONSE_TIME, TRIAL_TIME, MOVE_TIME, LOOK_BACK_TIME = 2.3, 0.85, 0.8, 1.3
+RESPONSE_TIME, TRIAL_TIME, MOVE_TIME, PREVIOUS_GAINS_TIME = 2.3, 0.85, 0.8, 1.3
 
 REDESIGNED = "gains designed again from what was measured: "  # first words of the note on such gains
 

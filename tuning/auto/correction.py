@@ -16,7 +16,7 @@ from mechanics.arrays import Floats, Integers, Mask
 from tuning.auto.bench import MOVE_TIME, REDESIGNED, TRIAL_TIME
 from tuning.auto.design import design_axes
 from tuning.auto.loop_margins import MEASURED, OVERSHOOT_ERROR, measure, measured_axis
-from tuning.auto.moves import load, show, step
+from tuning.auto.moves import load, record_final_move, step
 from tuning.auto.proving import RESTLESS
 from tuning.auto.stages import RecordedGains
 from tuning.auto.trying import between
@@ -85,7 +85,7 @@ def correct(
     for number in range(CORRECTIONS + 1):
         if changed.any():
             say("verifying gains on the drives", 0.72 + 0.08 * number)
-            recorded = step(bench, show(bench, recorded, changed), changed)
+            recorded = step(bench, record_final_move(bench, recorded, changed), changed)
             recorded = measure(bench, basis, recorded, changed)
             recorded = load(bench, basis, recorded, target, changed)
             most = np.where(changed, np.minimum(most, _most_velocity_p(bench, best, recorded)), most)

@@ -10,7 +10,7 @@ import numpy as np
 from drive_env.drives.raw_gains import write_gains
 from drive_env.safety.envelope import SafetyError
 from mechanics.arrays import Mask
-from tuning.auto.bench import LOOK_BACK_TIME
+from tuning.auto.bench import PREVIOUS_GAINS_TIME
 from tuning.auto.load_step import NOISE, SWING, load_step
 from tuning.auto.loop_margins import measured_axis
 from tuning.auto.loop_model import loop_models
@@ -26,7 +26,7 @@ CALMING = 0.5  # s for an oscillation after a load step to decay with calm gains
 BY_COMPARISON = "by a move, which was better than with the new ones: the gains before are kept"
 
 
-def show(bench: AutoBench, recorded: RecordedGains, where: Mask) -> RecordedGains:
+def record_final_move(bench: AutoBench, recorded: RecordedGains, where: Mask) -> RecordedGains:
     """Record a move of axes with their gains, and check whether they are at rest afterwards."""
     going = bench.target.together(where & bench.going)
     if not going.any():
@@ -109,10 +109,10 @@ def load(bench: AutoBench, basis: Basis, recorded: RecordedGains, target: Target
     return replace(recorded, loaded=loaded, failed=failed, swing=most)
 
 
-def look_back(bench: AutoBench, basis: Basis, recorded: RecordedGains) -> RecordedGains:
+def record_previous_gains(bench: AutoBench, basis: Basis, recorded: RecordedGains) -> RecordedGains:
     """Record a move with the gains before if these are safe by the model; keep them if they are better."""
     going = bench.going
-    late = ~bench.affordable(LOOK_BACK_TIME)
+    late = ~bench.affordable(PREVIOUS_GAINS_TIME)
     why = np.where((basis.unsafe == "") & late, "the drive time was used up", basis.unsafe)
     able = bench.whole_machines(going & (why == ""))
     for k in map(int, np.flatnonzero(going & ~able)):

@@ -30,7 +30,7 @@ from tuning.auto.correction import correct
 from tuning.auto.design import design_axes
 from tuning.auto.identified import identify, prepare
 from tuning.auto.loop_margins import judge
-from tuning.auto.moves import look_back
+from tuning.auto.moves import record_previous_gains
 from tuning.auto.result import collect
 from tuning.auto.settings import begin, commission, write
 from tuning.auto.stages import Basis, RecordedGains
@@ -119,7 +119,7 @@ def auto(
         )
         recorded = correct(bench, basis, tried, target, progress, improves=method.improves)
         progress("comparing with the gains before", 0.94)
-        recorded = judge(bench, basis, look_back(bench, basis, recorded))
+        recorded = judge(bench, basis, record_previous_gains(bench, basis, recorded))
         tell_of_lateness(bench)
         if not is_recorded(target.drives):
             bench.note(np.ones(target.num_axes, bool), COMPUTED)

@@ -35,7 +35,7 @@ By = Annotated[
 
 
 def _from_file(context: typer.Context, path: Path | None) -> Path | None:
-    """Use settings.toml of a search as defaults of all other options."""
+    """Use settings.toml of a search, if given, as defaults of all other options."""
     if path is not None:
         with errors_as_exit_codes():
             from tuning.search.trials_files import load_options

@@ -106,6 +106,7 @@ class CommissioningPath:
 
         Raises:
             BusError: If the drives can no longer be reached; the path must be left then.
+            ValueError: For a step that is done.
         """
         step, bench = STEPS[name], self.bench
         if self.states[name].state == DONE:

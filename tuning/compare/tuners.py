@@ -52,7 +52,7 @@ class MissingTunerError(ValueError):
 
 
 def tuner_rows() -> dict[str, TunerKind]:
-    """Return all tuners by name: those of this package, the rules, and those registered by other packages."""
+    """Return tuners by name: our own, rules, and those of other packages; MissingTunerError for a name used twice."""
     rows = {row.name: row for row in _OWN}
     rows |= {name: TunerKind(name, f"rule {name}", partial(RuleTuner, name)) for name in _rules()}
     rows |= {row.name: row for row in _AFTER}

@@ -233,7 +233,7 @@ def _turn(working: Working, where: Mask, configured: Floats) -> tuple[Floats, Fl
 
 
 def stay_inside(working: Working, where: Mask) -> None:
-    """Switch off an axis outside its travel: it lost the field and falls."""
+    """Switch off axes outside their travel, whose rotors have lost the field and fall."""
     down, up = working.room()
     out = where & ((up < 0.0) | (down > 0.0))
     if out.any():

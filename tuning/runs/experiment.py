@@ -302,7 +302,7 @@ def _position_scale(device: Device, dictionary: ObjectDictionary, preset: Mappin
 
 
 def _velocity_ratio(device: Device, dictionary: ObjectDictionary, preset: Mapping[str, int]) -> float:
-    """Return the rpm per velocity unit of such a drive; 1 for a drive without such a unit."""
+    """Return the rpm per velocity unit of a drive commissioned with a preset; 1 for a drive without such a unit."""
     scale = velocity_ratio(device.roles)
     return 1.0 if scale is None else _made(scale, dictionary, preset)
 

@@ -72,7 +72,7 @@ def set_gains(desk: TuneDesk, axis: int, wanted: dict[int, int], what: str) -> C
 
 
 def undo(desk: TuneDesk, axis: int) -> Callable[[Drives], str]:
-    """Return the job that undoes the newest change of an axis' gains; the job returns the name of that change."""
+    """Return the job that undoes and names the newest change of an axis' gains; ValueError without a change."""
 
     def job(drives: Drives) -> str:
         change = desk.last_change(axis)
