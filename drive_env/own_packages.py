@@ -1,4 +1,4 @@
-"""Are the packages that Python finds ours? `mechanics`, `tuning` and `agents` are names that others use too."""
+"""Checks that Python finds our packages: others name theirs `mechanics`, `tuning` and `agents`, too."""
 
 from __future__ import annotations
 

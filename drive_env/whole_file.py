@@ -131,7 +131,7 @@ def check_seal(path: Path, table: Mapping[str, Any], *, unchecked: bool = False)
     Args:
         path: For the message.
         table: What the file holds.
-        unchecked: Let pass what was changed, and what has no check sum; what is torn never.
+        unchecked: Accept a changed file, and one without check sum; a truncated one is refused all the same.
     """
     check = table.get(_CHECK)
     stated = check.get(_SUM) if isinstance(check, dict) else None

@@ -110,7 +110,7 @@ class Line(Bundle):
         return bool(self.latency.any() or self.jitter.any())
 
     def reset(self, latency: Floats, jitter: Floats, first: NDArray[Any], where: Mask) -> None:
-        """Restart the environments where the mask is true, with the message that counts before the first one."""
+        """Restart environments with the message that counts before the first; ValueError for delays beyond `depth`."""
         lanes, width, depth = len(where), first[0].size, self.arrivals.shape[1]
         if self.held.shape[1] != width:
             self.replace(messages=np.zeros((lanes, depth, width)), held=np.zeros((lanes, width)))

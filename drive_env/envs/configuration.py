@@ -54,7 +54,7 @@ def configured(
         options: Fields that replace the source's.
 
     Raises:
-        ValueError: For an unknown field, naming the known ones, or a file that is not TOML.
+        ValueError: For an unknown field, a value of another type, or a file that is not TOML.
     """
     if source is None:
         table: dict[str, Any] = {}

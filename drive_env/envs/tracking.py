@@ -532,7 +532,7 @@ class Tracking(VectorEnvironment):
         return bool(own.ended[0].any())
 
     def _followed(self) -> tuple[Floats, Floats]:
-        """Return the reference at the drives' present time: position [inc] and velocity, (num_axes,) each."""
+        """Return the reference at the drives' present time: position [inc] and velocity [606Ch], (num_axes,)."""
         own = self._episodes
         at = np.clip(own.lanes["step"] * self.config.cycles, 0, own.reference.shape[2] - 1)
         position, velocity = own.reference[np.arange(len(own.reference)), :2, np.repeat(at, self._axes)].T

@@ -48,7 +48,7 @@ class Window:
         glfw.swap_interval(0)  # time is the environment's: nothing waits for the screen
 
     def show(self, image: Image) -> None:
-        """Show a picture, uint8 of shape (height, width, 3); once the user has closed the window, do nothing."""
+        """Show a picture, uint8 of shape (height, width, 3), else ValueError; in a closed window do nothing."""
         if not self.is_open:
             return
         glfw, gl = self._glfw, self._gl

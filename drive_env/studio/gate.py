@@ -123,7 +123,7 @@ class StudioGate:
 
 
 def _malformed(path: str, names: list[str]) -> tuple[int, str] | None:
-    """Return status and reason of a refusal by form: browsers never send it, and other programs may misread it."""
+    """Return status and reason for a request that no browser sends and programs may misread; None for others."""
     if twice := [name for name in ONCE if names.count(name) > 1]:
         return 400, f"The request has {names.count(twice[0])} {twice[0].capitalize()} headers; it may have one."
     if path.startswith("//") or "\\" in path or not path.isprintable():

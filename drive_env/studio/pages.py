@@ -19,7 +19,7 @@ OWN = (axes, scope, dictionary, machine, runs)
 
 
 def studio_pages(*, emulated: bool) -> list[StudioPage]:
-    """Return the pages in order; a page that cannot be loaded is omitted, and logged."""
+    """Return the pages in order, without those that cannot be loaded (logged); ValueError for a path used twice."""
     found = list(OWN)
     for entry in importlib.metadata.entry_points(group=ENTRY_POINTS):
         try:

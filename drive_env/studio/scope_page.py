@@ -431,7 +431,7 @@ def _choices(session: Session) -> dict[tuple[int, int], Entry]:
 
 
 def _response(labels: list[str]) -> str | None:
-    """Return the default channel for a step's figures: the actual position, since a move ends at another value."""
+    """Return the default channel for a step's figures: the actual position, else the first; None without channels."""
     return next((one for one in labels if "osition actual" in one), labels[0] if labels else None)
 
 

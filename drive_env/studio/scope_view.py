@@ -262,7 +262,7 @@ class ScopeView:
 
 
 def with_channels(view: ScopeView, channels: tuple[ScopeChannel, ...]) -> None:
-    """Set the displayed channels.
+    """Set the displayed channels; a kept recording of others is dropped while the scope runs.
 
     Raises:
         ValueError: For more than eight.

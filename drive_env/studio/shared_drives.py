@@ -114,7 +114,7 @@ class SharedDrives(DrivesProxy):
             return self._calling(lambda: self._drives.read(name))
 
     def write(self, name: ObjectName, value: ArrayLike, where: Mask | None = None) -> None:
-        """Write an object of every axis, or of some."""
+        """Write an object of every axis, or of some; JobStoppedError for an enabling controlword of a stopped job."""
         operates = name in CONTROLWORDS and _operates(value)
         before, moves = self.moved, self.moved | (True if where is None else where)
         self.moved = moves if operates else before  # set before `_look`, which ends the job if its page is closed

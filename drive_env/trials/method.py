@@ -222,7 +222,7 @@ class ClosedStepper(OpenLoop):
         return self.first(supply)
 
     def safe(self, found: Identified, move: Move, supply: Floats) -> Integers:
-        """Return a third of the first gains, which catch up more slowly."""
+        """Return a third of the first gains (of a PID's I a ninth), which catch up more slowly."""
         gains, known = self.first(supply), self.device.gains
         if not self.loop.is_pid:
             return known.scaled(gains, SLOW, self._loop_columns())

@@ -74,7 +74,7 @@ def test_feedback_that_is_not_of_errors_is_not_reduced():
     ("arguments", "message"),
     [
         (["cascade", "-e", "gantry_beam_v1", "--out", "x.npz"], "give both"),
-        (["cascade", "-e", "GantryBeam-v1", "--out", "x.npz", "--dynamics", "stiff"], "not an agent that drive-agent"),
+        (["cascade", "-e", "GantryBeam-v1", "--out", "x.npz", "--dynamics", "stiff"], "not trained by drive-agent"),
         (["cascade", "-e", "GantryBeam-v1", "--dynamics", "lively"], "give soft, standard, stiff"),
         (["nothing", "-e", "gain_tuning"], "not in ServoDrive/GainTuning-v0"),
     ],
