@@ -572,8 +572,7 @@ class Node:
                 sent.start()
         elif state is NmtState.STOPPED:
             self._close_sdo()
-            # The only link between the two state machines (manual, section 2.2). A stop after an error is already
-            # reported.
+            # The only link of the state machines (TMCM-1636 manual, section 2.2); stops by errors are reported already
             if self._axes.trip(told) and is_commanded:
                 self._errors.condition(told, self._now)
 

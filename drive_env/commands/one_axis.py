@@ -357,7 +357,7 @@ def go(one: OneAxis, goal: int, velocity: int, *, relative: bool, is_recorded: b
 
 
 def _arrive(one: OneAxis, velocity: int, timeout: float) -> None:
-    """Wait until the target is reached; RuntimeError for an axis that stands at a limit."""
+    """Wait until the target is reached; RuntimeError at a limit, TimeoutError after `timeout` [s]."""
     from drive_env import motion
     from drive_env.fieldbus.errors import BusError
 

@@ -12,9 +12,7 @@ from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from mechanics.arrays import Floats
 from mechanics.reading.near_names import did_you_mean
 
 TWO_PI = 2.0 * np.pi
@@ -181,9 +179,3 @@ def find_unit(name: str) -> Unit:
     return Unit(
         name, f"{number:g} times: {row.meaning}", lambda c: number * row.factor(c), follows_scale=row.follows_scale
     )
-
-
-def wrap(value: NDArray[Any]) -> Floats:
-    """Return increments [float] wrapped into the range of a signed counter of 32 bits."""
-    half = 2.0**31
-    return np.mod(np.asarray(value, np.float64) + half, 2.0 * half) - half

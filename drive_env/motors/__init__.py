@@ -320,8 +320,8 @@ def _built(name: str, title: str, kind: str, values: Mapping[str, float], source
         raise MotorError(f"{wrong[0]}: {other}; there are {', '.join(near)}")
     n_p = 1 if is_dc else int(values["pole_pairs"])
     torque, speed = values["rated_torque_nm"], values["rated_speed_rpm"] * RPM
-    k = _torque_constant(kind, n_p, values)
-    current = _rated_current(values, torque, k, kind)
+    k = _torque_constant(kind, values)
+    current = _rated_current(values, torque, k)
     if k is None:
         k = torque / current
     halved = 0.5 if "resistance_line_to_line_ohm" in values else 1.0
@@ -374,7 +374,7 @@ def _stepper(
     if steps % 4:
         raise MotorError(f"full_steps = {steps} must be a multiple of 4: four of them are a period of the current")
     n_p = steps // 4
-    current = _rated_current(values, torque, None, "stepper")
+    current = _rated_current(values, torque, None)
     kept = 1.0 - values.get("torque_saturation", SATURATION_SHARE)
     R, L, psi_m = values["resistance_phase_ohm"], values["inductance_phase_h"], torque / (n_p * current * kept)
     return Motor(
@@ -466,7 +466,7 @@ def _inductances(values: Mapping[str, float]) -> tuple[float, float]:
     return halved * values[key], halved * values[_one_of((across,), values)]
 
 
-def _torque_constant(kind: str, n_p: int, values: Mapping[str, float]) -> float | None:
+def _torque_constant(kind: str, values: Mapping[str, float]) -> float | None:
     """Return torque per ampere of peak current [N*m/A], None if it follows from the rated point."""
     given = [key for key in TORQUE_CONSTANT if key in values]
     if len(given) > 1:
@@ -487,8 +487,8 @@ def _torque_constant(kind: str, n_p: int, values: Mapping[str, float]) -> float 
     }[key]
 
 
-def _rated_current(values: Mapping[str, float], torque: float, k: float | None, kind: str) -> float:
-    """Return the rated current, peak [A]: as given, or that of the rated torque."""
+def _rated_current(values: Mapping[str, float], torque: float, k: float | None) -> float:
+    """Return the rated current, peak [A]: as given, or that of the rated torque by k [N*m/A]; MotorError without k."""
     given = [key for key in RATED_CURRENT if key in values]
     if len(given) > 1:
         raise MotorError(f"{' and '.join(given)} are two forms of the same number; keep one")

@@ -16,6 +16,7 @@ from drive_env.dictionary.codec import decode, encode
 from drive_env.dictionary.entries import ObjectName
 from drive_env.dictionary.roles import Role
 from drive_env.drives.interface import CYCLE
+from drive_env.trials.positioning import wrapped
 from mechanics.arrays import Floats, Integers, Mask
 
 if TYPE_CHECKING:
@@ -148,10 +149,10 @@ class Recorder:
         mode = k[MODE]
         lag = None
         if CURRENT not in k and Role.FULL_STEPS in drives.device.roles:
-            behind = from_raw(drives, POSITION, units.wrap(k[POSITION_DEMAND] - k[POSITION]), self._axes)
+            behind = from_raw(drives, POSITION, wrapped(k[POSITION_DEMAND] - k[POSITION]), self._axes)
             lag = behind / (2.0 * np.pi) * drives.read(Role.FULL_STEPS)[self._axes]
         # From one millisecond to the next, across the end of the counter too.
-        slope = units.wrap(np.diff(k[POSITION_DEMAND], axis=0, prepend=k[POSITION_DEMAND][:1]))
+        slope = wrapped(np.diff(k[POSITION_DEMAND], axis=0, prepend=k[POSITION_DEMAND][:1]))
         profiled = from_raw(drives, POSITION_DEMAND, slope, self._axes) / self._period
         wanted = np.stack(self._wanted)
         followed = from_raw(drives, POSITION_DEMAND, wanted[:, 0], self._axes)

@@ -182,8 +182,7 @@ class LimitsInForce:
         except RefusedError:  # the EDS lists an object that the drive lacks: the envelope alone monitors this limit
             return
         switched_off = own == 0 and key in (FOLLOWING_WINDOW, MAX_PROFILE_VELOCITY, MAX_MOTOR_SPEED)
-        # Lending one end alone could leave the range empty: the other is lent as well, if need be as the end of its
-        # type.
+        # Lending one end alone could leave the range empty: the other is lent, too, if need be as its type's end.
         no_range = key in (POSITION_LOW, POSITION_HIGH) and self._has_no_range(axis)
         value = max(min(limit, float(entry.high)), float(entry.low))
         tighter = value < own if is_upper else value > own

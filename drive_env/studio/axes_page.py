@@ -35,7 +35,7 @@ def build(session: Session, visitor: Visitor) -> None:
         group_card(session, visitor)
     with ui.element("div").classes("studio-grid"):
         with ui.element("div").classes("studio-stack"):
-            _state_card(session, visitor)
+            _state_card(visitor)
         with ui.element("div").classes("studio-stack"):
             _motion_card(session, visitor)
             with card("Move", "card-move"):
@@ -51,7 +51,7 @@ async def _command(event: GenericEventArguments, visitor: Visitor) -> None:
     await visitor.do(motion_jobs.command(visitor.axis, word), f"Controlword {word:02X}h")
 
 
-def _state_card(session: Session, visitor: Visitor) -> None:
+def _state_card(visitor: Visitor) -> None:
     async def start() -> None:
         await visitor.do(motion_jobs.start_node(visitor.axis), f"Start the node of axis {visitor.axis}")
 

@@ -52,7 +52,7 @@ def swung(**options):
 
 def model_lag(target, plant):
     """Return the velocity loop's lags around the relay's current loop [s]."""
-    return velocity_lag(target.device, plant, take_current(Workbench(target.device, plant), target.device, plant))
+    return velocity_lag(plant, take_current(Workbench(target.device, plant), target.device, plant))
 
 
 def test_an_ideal_axis_shows_its_slope_and_its_lags():
@@ -241,7 +241,7 @@ def test_a_rule_takes_its_shares_of_the_ultimate_point_and_of_what_was_reached()
 def test_a_load_that_twists_is_held_to_the_crossover_that_the_rule_will_have(monkeypatch):
     """Of an integrator with a dead time the crossover turns by pi/2 over 3.2: so much of the lag counts."""
     asked = []
-    monkeypatch.setattr(module, "velocity_lag", lambda device, plant, current: 1e-3)
+    monkeypatch.setattr(module, "velocity_lag", lambda plant, current: 1e-3)
     monkeypatch.setattr(module, "slow_enough", lambda bench, plant, lag, turn: asked.append((lag, turn)) or 2e-3)
     monkeypatch.setattr(module, "finish", lambda bench, ultimate, slope: (ultimate, slope))
     ultimate, slope = relay_rule(DEVICE, MOTOR, PLANT)

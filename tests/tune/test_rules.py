@@ -272,7 +272,7 @@ def test_a_loop_that_lags_so_much_turns_its_phase_by_so_much():
     current = axis.L / gains_in_si(DEVICE, axis.supply, gains).torque_p
     # At low frequencies the winding's own behaviour under back-EMF shows: look at the growth between two.
     lag = float(np.diff(beyond)[0] / (2.0 * math.pi * np.diff(f)[0]))
-    assert velocity_lag(DEVICE, axis, current) == pytest.approx(lag, rel=0.1)
+    assert velocity_lag(axis, current) == pytest.approx(lag, rel=0.1)
     assert current_lag(DEVICE) == pytest.approx(60e-6)
 
 
@@ -310,7 +310,7 @@ def proposed(rule, axis):
 
 def small_of(axis, si, loss=0.0):
     """The small time constants that the velocity loop has around the current loop that was reached [s]."""
-    return velocity_lag(DEVICE, axis, axis.L / (si.torque_p + loss))
+    return velocity_lag(axis, axis.L / (si.torque_p + loss))
 
 
 @pytest.mark.parametrize(

@@ -160,7 +160,7 @@ def measured(monkeypatch):
         monkeypatch.setattr(module, "to_counts", lambda drives, current: np.rint(current * 1e3).astype(int))
         monkeypatch.setattr(module, "enable", lambda working, mode, where: log.append((mode, where.tolist())))
         monkeypatch.setattr(module, "stay_inside", lambda working, where: log.append("inside"))
-        monkeypatch.setattr(module, "still_enabled", lambda working, status: np.array(alive))
+        monkeypatch.setattr(module, "still_enabled", lambda status: np.array(alive))
         monkeypatch.setattr(module, "switch_off", lambda drives, where: log.append(("off", where.tolist())))
         monkeypatch.setattr(module, "stop_causes", lambda drives: ["one", "overcurrent (2310h)"])
         motor = SimpleNamespace(kind="pmsm", n_p=4)

@@ -30,7 +30,7 @@ class FirstExperiments(Experiments):
         self._pulses = pulses
 
     def check(self, working: Working) -> Mask:
-        """Check the encoders."""
+        """Check the encoders; return which axes' are good."""
         self.good = super().check(working)
         return self.good
 

@@ -80,7 +80,7 @@ def check_encoders(working: Working) -> list[EncoderCheck]:
         drives.write(Role.OPEN_LOOP_CURRENT, 0, where=where)
         enable(working, "csv", where)
         away, back, field, halls, reasons = _turn(working, where, configured)
-        alive = still_enabled(working, drives.read(cia402.STATUSWORD))
+        alive = still_enabled(drives.read(cia402.STATUSWORD))
     finally:
         switch_off(drives, where)
         drives.write(Role.OPEN_LOOP_CURRENT, 0, where=where)
@@ -122,7 +122,7 @@ def _push(working: Working) -> list[Estimate]:
                     ]
                 )
                 stay_inside(working, waiting)
-                alive = still_enabled(working, drives.read(cia402.STATUSWORD))
+                alive = still_enabled(drives.read(cia402.STATUSWORD))
                 for k in np.flatnonzero(waiting):
                     towards = _likeness(angle[:, k], sign)
                     seen = np.ptp(angle[:, k]) >= LEAST_COUNTS * 2.0 * np.pi / working.target.motor.encoder_counts

@@ -223,7 +223,7 @@ class Experiments:
         self.begin("resonance, delay, filter", 0.7, RESPONSE)
         self.respond(working, inertia)
         working = self.calm(working)
-        on = working.where & still_enabled(working, drives.read(cia402.STATUSWORD))
+        on = working.where & still_enabled(drives.read(cia402.STATUSWORD))
         if on.any():
             go_back(replace(working, where=on), "csv", to=0.0)
 
@@ -253,7 +253,7 @@ class Experiments:
         """Return the currents that hold the axes at rest in csp [A]."""
         drives = working.target.drives
         trace = drives.record([cia402.TORQUE_ACTUAL], HOLD * CYCLE)
-        alive = still_enabled(working, drives.read(cia402.STATUSWORD))
+        alive = still_enabled(drives.read(cia402.STATUSWORD))
         causes = [] if alive.all() else stop_causes(drives)
         for k in np.flatnonzero(working.where & ~alive):
             self.refuse(int(k), NAMES[4:], f"the drive switched off while it held the axis: {causes[k]}")
@@ -275,7 +275,7 @@ class Experiments:
         target, drives = working.target, working.target.drives
         # Still enabled: a loaded axis would fall between the experiments otherwise.
         go_back(working, "csv")
-        able = working.where & still_enabled(working, drives.read(cia402.STATUSWORD))
+        able = working.where & still_enabled(drives.read(cia402.STATUSWORD))
         down, up = working.room()
         causes = [] if able.all() else stop_causes(drives)
         for k in np.flatnonzero(working.where):

@@ -247,7 +247,7 @@ def move(working: Working, plan: Plan) -> tuple[Floats, Floats, Mask]:
         )
         angles.append(working.angle(trace[cia402.POSITION_ACTUAL]))
         currents.append(trace[cia402.TORQUE_ACTUAL] * ampere_per_count(drives))
-        alive &= still_enabled(working, trace[cia402.STATUSWORD][-1])
+        alive &= still_enabled(trace[cia402.STATUSWORD][-1])
         error = way[k + len(raw) - 1] - angles[-1][-1]
     return np.concatenate(angles), np.concatenate(currents), alive
 

@@ -64,7 +64,7 @@ def standstill_resistances(working: Working) -> list[Estimate]:
             currents[row] = raw * per_count
             angles[row] = working.angle(drives.read(cia402.POSITION_ACTUAL))
         field = drives.read(Role.FIELD_ANGLE) * (2.0 * np.pi / 65536.0)
-        alive = still_enabled(working, drives.read(cia402.STATUSWORD))
+        alive = still_enabled(drives.read(cia402.STATUSWORD))
     finally:
         switch_off(drives, where)
         drives.write(Role.OPEN_LOOP_CURRENT, 0, where=where)

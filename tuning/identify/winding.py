@@ -144,7 +144,7 @@ def pulse(working: Working, holding: Floats, repeats: int = REPEATS) -> Pulses:
         if late > MOST_LATE:
             break
     current[rows] = drives.read(cia402.TORQUE_ACTUAL) * per_count
-    alive = still_enabled(working, drives.read(cia402.STATUSWORD))
+    alive = still_enabled(drives.read(cia402.STATUSWORD))
     step = (times[-1] - times[0]) / rows if late > MOST_LATE else CYCLE
     return Pulses(demand, current, angle, duty_sum / (32768.0 * 256.0), blocks[:rows], alive, step)
 
@@ -262,7 +262,7 @@ def _winding(working: Working, axis: _AxisWinding, k: int, electrical: float, po
             if moved.max() < SETTLED:
                 break
         results.append(solved)
-    return _judge(working, axis, _average(results, axis.block), window)
+    return _judge(working, axis, _average(results, axis.block))
 
 
 def _window(
@@ -410,7 +410,7 @@ def _solve(
     return _Solved(b, spread, float(rest @ rest) + len(y) * floor, penalty)
 
 
-def _judge(working: Working, axis: _AxisWinding, found: _Fit, window: _Window) -> Winding:
+def _judge(working: Working, axis: _AxisWinding, found: _Fit) -> Winding:
     """Return the estimates with their intervals, or with the reason of a refusal."""
     target = working.target
     t = t_quantile(found.freedom)

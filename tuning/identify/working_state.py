@@ -253,7 +253,7 @@ def switch_off(drives: Drives, where: Mask) -> None:
     motion.disable(drives, where & ~fault)
 
 
-def still_enabled(working: Working, status: Integers) -> Mask:
+def still_enabled(status: Integers) -> Mask:
     """Return which axes are in "operation enabled" by their statuswords."""
     return np.asarray(cia402.matches(status, cia402.OPERATION_ENABLED))
 

@@ -404,7 +404,7 @@ class _Measurement:
         coherence = np.where(where, coherence, 0.0)
         traced = np.zeros(len(f), bool)
         if self._traced:
-            fast = _fast(self._device, seen, self._lines)
+            fast = _fast(seen, self._lines)
             f = np.concatenate([f, fast[0]])
             open_loop = np.concatenate([open_loop, np.where(where, fast[1], np.nan)])
             coherence = np.concatenate([coherence, np.where(where, fast[2], 0.0)])
@@ -470,7 +470,7 @@ def _duration(periods: int, lines: Lines) -> float:
     return (2 * RAMP + SETTLING + periods * lines.samples) * CYCLE
 
 
-def _fast(device: Device, seen: Pass, lines: Lines) -> tuple[Floats, Complex, Floats]:
+def _fast(seen: Pass, lines: Lines) -> tuple[Floats, Complex, Floats]:
     """Return frequencies above the bus's limit, open loop and coherence there, from the trace.
 
     The excitation there consists of the images of the held set-points.

@@ -28,7 +28,7 @@ def cascade_rule(device: Device, motor: Motor, plant: Plant) -> Proposal:
     """Propose gains loop by loop; notes name what limits the velocity loop."""
     bench = Workbench(device, plant)
     lag = take_current(bench, device, plant)
-    small = slow_enough(bench, plant, velocity_lag(device, plant, lag), 1.0 / SPREAD)
+    small = slow_enough(bench, plant, velocity_lag(plant, lag), 1.0 / SPREAD)
     slope = plant.torque_constant / plant.inertia
     wanted = 1.0 / (SPREAD * slope * small)
     quiet = NOISE * motor.rated_current / velocity_noise(device, plant)

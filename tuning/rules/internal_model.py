@@ -48,7 +48,7 @@ def imc_rule(device: Device, motor: Motor, plant: Plant) -> Proposal:
     wanted = imc_first_order(1.0 / plant.R, plant.L / plant.R, IMC_CURRENT * current_lag(device))
     lag = plant.L / bench.p("current", wanted.p)
     bench.time("current", wanted.time)
-    small = slow_enough(bench, plant, velocity_lag(device, plant, lag), 1.0 / IMC_VELOCITY)
+    small = slow_enough(bench, plant, velocity_lag(plant, lag), 1.0 / IMC_VELOCITY)
     slope = plant.torque_constant / plant.inertia
     crossover = bench.p("velocity", 1.0 / (slope * IMC_VELOCITY * small)) * slope
     if plant.viscous > 0.0:
@@ -67,7 +67,7 @@ def simc_rule(device: Device, motor: Motor, plant: Plant) -> Proposal:
     wanted = simc_first_order(1.0 / plant.R, plant.L / plant.R, dead, dead)
     lag = plant.L / bench.p("current", wanted.p)
     bench.time("current", wanted.time)
-    small = slow_enough(bench, plant, velocity_lag(device, plant, lag), 0.5)
+    small = slow_enough(bench, plant, velocity_lag(plant, lag), 0.5)
     slope = plant.torque_constant / plant.inertia
     crossover = bench.p("velocity", simc_integrating(slope, small, small).p) * slope
     bench.time("velocity", 4.0 / crossover)

@@ -26,11 +26,10 @@ def current_lag(device: Device) -> float:
     return 1.5 / device.current_rate
 
 
-def velocity_lag(device: Device, plant: Plant, current: float) -> float:
+def velocity_lag(plant: Plant, current: float) -> float:
     """Return the sum of the velocity loop's small time constants [s].
 
     Args:
-        device: The drive.
         plant: The axis, with its delay and the corner of its velocity filter.
         current: Time constant of the closed current loop [s].
     """

@@ -60,7 +60,7 @@ def modulus_rule(device: Device, motor: Motor, plant: Plant) -> Proposal:
     """
     bench = Workbench(device, plant)
     lag = take_current(bench, device, plant)
-    small = slow_enough(bench, plant, velocity_lag(device, plant, lag), 0.5)
+    small = slow_enough(bench, plant, velocity_lag(plant, lag), 0.5)
     slope = plant.torque_constant / plant.inertia
     if plant.viscous > 0.0:
         found = modulus_optimum(plant.torque_constant / plant.viscous, plant.inertia / plant.viscous, small)
@@ -77,7 +77,7 @@ def symmetrical_rule(device: Device, motor: Motor, plant: Plant) -> Proposal:
     """Propose the symmetrical optimum for the velocity loop, and the modulus optimum for the current loop."""
     bench = Workbench(device, plant)
     lag = take_current(bench, device, plant)
-    small = slow_enough(bench, plant, velocity_lag(device, plant, lag), 1.0 / SPREAD)
+    small = slow_enough(bench, plant, velocity_lag(plant, lag), 1.0 / SPREAD)
     slope = plant.torque_constant / plant.inertia
     reached = bench.p("velocity", symmetrical_optimum(slope, small).p)
     crossover = reached * slope

@@ -54,7 +54,7 @@ def pole_rule(device: Device, motor: Motor, plant: Plant) -> Proposal:
     bench.time("current", p / (natural**2 * plant.L))
     # With this damping the lag of the closed current loop is L over proportional gain plus resistance.
     lag = plant.L / (p + plant.R)
-    small = slow_enough(bench, plant, velocity_lag(device, plant, lag), LAG_SHARE)
+    small = slow_enough(bench, plant, velocity_lag(plant, lag), LAG_SHARE)
     storage, loss = plant.inertia / plant.torque_constant, plant.viscous / plant.torque_constant
     natural = max(LAG_SHARE / (2.0 * VELOCITY_DAMPING * small), 0.6 * loss / (VELOCITY_DAMPING * storage))
     p = bench.p("velocity", place_first_order(storage, loss, natural, VELOCITY_DAMPING).p)

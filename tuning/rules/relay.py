@@ -85,7 +85,7 @@ def relay_rule(device: Device, motor: Motor, plant: Plant) -> Proposal:
     `relay_experiment` measures the ultimate point instead.
     """
     bench = Workbench(device, plant)
-    lag = velocity_lag(device, plant, take_current(bench, device, plant))
+    lag = velocity_lag(plant, take_current(bench, device, plant))
     lag = slow_enough(bench, plant, lag, 0.5 * math.pi * GAIN_SHARE)
     slope = plant.torque_constant / plant.inertia
     return finish(bench, ultimate_of_integrator(slope, lag), slope)

@@ -477,8 +477,7 @@ class _Search:
         step = np.clip(point - nearest, -SAFE_STEP, SAFE_STEP)
         for _ in range(SAFE_HALVINGS):
             # Not beyond gains that oscillated (each at least as large) or currents that lost steps (each at most as
-            # large),
-            # nor closer to them than half a step.
+            # large), nor closer to them than half a step.
             if not any(
                 np.all(caution * (nearest + step - bad) >= 0.0) or np.abs(nearest + step - bad).max() < 0.5 * SAFE_STEP
                 for bad in self._refuted[k]

@@ -11,7 +11,7 @@ LIMIT_MARGIN = 0.017453292519943295
 
 @stage
 def corrected_minimum(drive, lane):
-    """Return 607Dh:01 corrected by the home offset (manual, section 6.1.11) [rad]."""
+    """Return 607Dh:01 corrected by the home offset (TMCM-1636 manual, section 6.1.11) [rad]."""
     return drive.position_min[lane] - drive.home_offset[lane]
 
 

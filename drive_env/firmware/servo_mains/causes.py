@@ -149,7 +149,7 @@ def over_speed(drive, lane, told):
 
 @stage
 def contouring(drive, lane, told):
-    """Return whether the following error exceeds P-Max..., or than 6065h for longer than 6066h."""
+    """Return whether the following error exceeds P-Max..., or 6065h for longer than 6066h."""
     most = drive.error_turns[lane] + drive.error_angle[lane]
     by_position = drive.drive_function[lane] > 0.0 and drive.loop_level[lane] == 2.0
     if by_position and 0.0 < most < abs(drive.position_demand[lane] - drive.theta_meas[lane]):

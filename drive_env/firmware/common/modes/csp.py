@@ -1,4 +1,4 @@
-"""Cyclic synchronous position mode (manual, section 9)."""
+"""Cyclic synchronous position mode (TMCM-1636 manual, section 9)."""
 
 from __future__ import annotations
 

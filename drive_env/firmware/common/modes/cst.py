@@ -1,4 +1,4 @@
-"""Cyclic synchronous torque mode (manual, section 11): the target torque is the current loop's set-point."""
+"""Cyclic synchronous torque mode (TMCM-1636 manual, section 11): the target torque is the current loop's set-point."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cyclic synchronous velocity mode (manual, section 10)."""
+"""Cyclic synchronous velocity mode (TMCM-1636 manual, section 10)."""
 
 from __future__ import annotations
 

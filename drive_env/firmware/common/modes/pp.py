@@ -1,4 +1,4 @@
-"""Profile position mode (manual, section 6)."""
+"""Profile position mode (TMCM-1636 manual, section 6)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Profile velocity mode (manual, section 7)."""
+"""Profile velocity mode (TMCM-1636 manual, section 7)."""
 
 from __future__ import annotations
 
