@@ -47,7 +47,7 @@ def margins(
         from drive_env.loops.dynamics import find_dynamics
 
         if out is not None and (dynamics is None or out.suffix != ".npz"):
-            raise ValueError("--out writes an agent, a new .npz, that keeps --dynamics; give both")
+            raise ValueError("--out FILE.npz writes an agent that keeps --dynamics; give both, and that ending")
         if out is not None and out.exists():
             raise ValueError(f"--out {out} is there already; give a new file")
         asked = None if dynamics is None else find_dynamics(dynamics)

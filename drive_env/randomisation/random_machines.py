@@ -359,7 +359,9 @@ class RandomMachines(Saved):
                 self._set(one)
             except ValueError as error:
                 if attempt == _TRIES - 1:
-                    raise ValueError(f"{_TRIES} draws in a row gave impossible machines: {error}") from error
+                    raise ValueError(
+                        f"{_TRIES} draws gave impossible machines: {error}; narrow the distributions"
+                    ) from error
                 self._draw(lane, rng, stage, fixed)
             else:
                 return

@@ -37,11 +37,7 @@ COMMANDS: tuple[tuple[Key, str, Key], ...] = (
     ((cia402.TARGET_VELOCITY, 0), "csv", (cia402.TARGET_VELOCITY, 0)),
     ((cia402.TARGET_TORQUE, 0), "cst", (cia402.TARGET_TORQUE, 0)),
 )
-RESPONSES: tuple[Key, ...] = (
-    (cia402.POSITION_ACTUAL, 0),
-    (cia402.VELOCITY_ACTUAL, 0),
-    (cia402.TORQUE_ACTUAL, 0),
-)  # position, velocity, current
+RESPONSES: tuple[Key, ...] = ((cia402.POSITION_ACTUAL, 0), (cia402.VELOCITY_ACTUAL, 0), (cia402.TORQUE_ACTUAL, 0))
 _POSITIONS: tuple[Key, ...] = ((cia402.POSITION_DEMAND, 0), (cia402.POSITION_ACTUAL, 0), (cia402.TARGET_POSITION, 0))
 MAX_SHIFT = 0.02  # s, greatest time shift of a response that is searched
 LATEST = 1e7  # s: at 1e300 a float has no resolution of milliseconds left

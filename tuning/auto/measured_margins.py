@@ -22,9 +22,8 @@ if TYPE_CHECKING:
 
 AT_ONCE = 64  # sets of gains whose loops are computed at once
 LOOPS = "velocity", "position"  # the judged loops
-FACTORS = {
-    variant.velocity_p: variant.name for variant in VARIANTS if variant.velocity_p != 1.0
-}  # factors of velocity P that the loops must tolerate
+# Factors of velocity P that the loops must tolerate.
+FACTORS = {variant.velocity_p: variant.name for variant in VARIANTS if variant.velocity_p != 1.0}
 
 
 class MeasuredAxis:
