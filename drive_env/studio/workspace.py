@@ -195,10 +195,10 @@ def _settings(table: Mapping[str, Any], description: Description) -> AxisSetting
     ):
         if value not in known:
             raise ValueError(f"{name} = {value!r} is not one of {', '.join(map(str, known))}")
-    if len(channels) > MOST_CHANNELS or not 0.0 <= found.before <= 0.9:
-        raise ValueError(
-            f"{len(channels)} channels, before = {found.before}: give {MOST_CHANNELS} at most, and 0 to 0.9"
-        )
+    if len(channels) > MOST_CHANNELS:
+        raise ValueError(f"{len(channels)} channels are too many; the scope shows {MOST_CHANNELS}")
+    if not 0.0 <= found.before <= 0.9:
+        raise ValueError(f"before = {found.before} must be 0 to 0.9")
     if not isinstance(found.jog_speed, str) or not isinstance(found.level, str):
         raise ValueError("jog_speed and level are texts with a unit")
     return found

@@ -198,7 +198,7 @@ def test_a_machine_that_cannot_be_stepped_is_drawn_again():
     machines.redraw(generators(6))
     assert np.all(machines.values["load.stiffness"] == default)
     laws["parameters"]["load.stiffness"]["values"] = [1e6]
-    with pytest.raises(ValueError, match=r"20 draws gave .*resonates at.*narrow the ranges"):
+    with pytest.raises(ValueError, match=r"20 draws gave .*resonates at.*narrow the distributions"):
         RandomMachines(drives, Distributions.load(laws)).redraw(generators(6))
     assert np.all(drives.machine.parameters["load.stiffness"] == default)
 

@@ -345,7 +345,7 @@ def test_a_workspace_is_found_again_from_its_file(tmp_path):
         ("6041:00", "velocity", "mend the line"),
         ('"single"', '"once"', "'once' is not one of roll, auto"),
         ("window = 2.0", "window = 3.0", "3.0 is not one of 0.1, 0.2"),
-        ("before = 0.1", "before = 1.5", "before is 0 to 0.9"),
+        ("before = 0.1", "before = 1.5", "before = 1.5 must be 0 to 0.9"),
         ("before = 0.1", "behind = 0.1", "missing, or are not known: before, behind"),
         ("before = 0.1", "before = [", "is not TOML"),
     ],
