@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rigs.process_image import ProcessImage
+from rigs.process_image import ProcessImage, write
 
 from drive_env import EmulatedDrives, ObjectAccessError, motion
 from drive_env.dictionary.aborts import (
@@ -64,17 +64,6 @@ def packed(values):
         start, size = rows[index]
         data[start : start + size] = value.to_bytes(size, "little", signed=True)
     return bytes(data)
-
-
-def write(image, index, sub, raw):
-    """Write an object, as a node does at an SDO; return 0, or the abort code."""
-    port = image.dictionary.port(index, sub)
-    try:
-        port.check(raw)
-    except ObjectAccessError as error:
-        return error.abort_code
-    port.write(raw)
-    return 0
 
 
 # --- layout -----------------------------------------------------------------------------------------------------------
@@ -149,17 +138,6 @@ def test_a_drive_of_can_alone_has_no_image():
         pytest.raises(ValueError, match="tmcm1636 has no process image: its dictionary lacks 1C12h; its process data"),
     ):
         ProcessImage(drives)
-
-
-@pytest.mark.parametrize(("options", "first"), [({"load": "gantry"}, 0), ({"load": "portal"}, 1)])
-def test_all_axes_of_a_module_are_in_its_image(options, first):
-    with (
-        EmulatedDrives("tmcm3313", num_threads=1, **options) as drives,
-        pytest.raises(
-            ValueError, match=rf"carries 3 axes from first_axis={first} on, and there are {drives.num_axes}:"
-        ),
-    ):
-        ProcessImage(drives, first)
 
 
 def test_the_image_of_a_second_module_is_its_own():

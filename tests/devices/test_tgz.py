@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from rigs import ROOT
 from rigs.canopen_wire import Wire
-from rigs.process_image import ProcessImage
+from rigs.process_image import ProcessImage, write
 from rigs.tables import every_row
 from rigs.tgz_images import SIZES, rows, structure
 
@@ -692,17 +692,6 @@ def test_a_braking_axis_feeds_the_other_one_through_the_link_of_the_drive(way):
 
 
 # --- process images: structures as the manual prints them, but for names --------------------------------------------
-
-
-def write(image, index, sub, raw):
-    """Write an object, as a node does at an SDO; return 0, or the abort code."""
-    port = image.dictionary.port(index, sub)
-    try:
-        port.check(raw)
-    except ObjectAccessError as error:
-        return error.abort_code
-    port.write(raw)
-    return 0
 
 
 def select(image, number):

@@ -25,7 +25,7 @@ def opened(load, device="tmcm1636", motor="qbl4208", **options):
         made.close()
 
 
-def until(condition, patience=10.0):
+def until(condition, patience=20.0):
     end = time.monotonic() + patience
     while not condition():
         assert time.monotonic() < end

@@ -7,6 +7,7 @@ import time
 
 import numpy as np
 import pytest
+from rigs.session_rig import until
 
 pytest.importorskip("nicegui", reason="the extra `studio` is not installed")
 
@@ -29,13 +30,6 @@ def session():
     assert made.state == "open", made.failure
     yield made
     made.close()
-
-
-def until(condition, patience=20.0):
-    end = time.monotonic() + patience
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.01)
 
 
 def do(session, job):

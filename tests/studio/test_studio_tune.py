@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from rigs.session_rig import until
 
 pytest.importorskip("nicegui", reason="the extra `studio` is not installed")
 
@@ -44,13 +45,6 @@ def desk(tmp_path, monkeypatch):
     assert made.state == "open", made.failure
     yield TuneDesk(made)
     made.close()
-
-
-def until(condition, patience=20.0):
-    end = time.monotonic() + patience
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.01)
 
 
 def do(desk, job, **options):

@@ -8,6 +8,7 @@ import shutil
 
 import numpy as np
 import pytest
+from rigs.closed_loop_rig import target_of
 from rigs.stepper_rig import BARE, lane
 from rigs.world_bus import on_bus
 from typer.testing import CliRunner
@@ -28,7 +29,7 @@ from tuning.stepper import commissioning
 from tuning.stepper.commissioning import WORKING_SHARE, commission
 from tuning.stepper.load_detection import LoadDetection
 from tuning.stepper.obstacle import prove_with_load
-from tuning.target import Target, emulated
+from tuning.target import emulated
 
 NAME = "qsh4218_51"
 MOTOR = MOTORS[NAME]
@@ -243,20 +244,11 @@ def over_a_bus(device, act):
         return act(drives)
 
 
-def six_axes(drives):
-    """Return drives as a target."""
-    count, device = drives.num_axes, drives.device
-    low, high = np.full(count, -60.0), np.full(count, 60.0)
-    return Target(
-        drives, device, MOTOR, np.full(count, MOTOR.voltage), low, high, MOTOR.rated_speed, MOTOR.rated_current
-    )
-
-
 @pytest.mark.slow
 def test_a_search_of_currents_finds_the_same_in_process_and_over_the_bus():
     def act(drives):
         return [
-            (row.gains.tolist(), row.cost) for row in optimise(six_axes(drives), Settings(trials=2, safe=True)).rows
+            (row.gains.tolist(), row.cost) for row in optimise(target_of(drives), Settings(trials=2, safe=True)).rows
         ]
 
     with EmulatedDrives("tmcm6212", **MACHINES) as drives:
@@ -272,7 +264,7 @@ def test_commissioning_finds_the_same_in_process_and_over_the_bus(tmp_path):
     """
 
     def act(drives):
-        result = commission(six_axes(drives), tmp_path / f"{id(drives)}.toml", keep=False)
+        result = commission(target_of(drives), tmp_path / f"{id(drives)}.toml", keep=False)
         return [(axis.after, axis.figures, axis.verdict, axis.reservations) for axis in result.axes]
 
     with EmulatedDrives("tmcm6212", **MACHINES) as drives:
