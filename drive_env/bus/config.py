@@ -160,7 +160,7 @@ def check_seed(bus: Bus) -> None:
 
 
 def store_folder(bus: Bus) -> Path | None:
-    """Return the folder of the nodes' stores, made if missing (else BusConfigError); None if they are in memory."""
+    """Make and return the folder of the nodes' stores, None if they are in memory; BusConfigError if it cannot be."""
     if bus.store is None:
         return None
     path = Path(bus.store)

@@ -179,7 +179,7 @@ class FmuDrive(Saved):
             check_in_range(known.find(rows[name].source), integers)
         changed = [row for name, row in rows.items() if np.any(values[name] != before[name])]
         with ExitStack() as undoing:
-            # Objects last: a drive may refuse to have its former mode again, a machine takes its former values.
+            # Objects last: a mode that is written and taken back leaves traces in the drive.
             for row in sorted(changed, key=lambda row: row.name in WRITTEN):
                 self._apply(row, values[row.name], before[row.name])
                 undoing.callback(self._apply, row, before[row.name], values[row.name])
