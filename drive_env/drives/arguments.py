@@ -44,7 +44,8 @@ def whole_cycles(duration: float, cycle: float) -> int:
     cycles = round(duration / cycle)
     if abs(cycles * cycle - duration) > 1e-9:
         raise ValueError(
-            f"{duration:g} s is not a whole number of communication cycles of {cycle:g} s; use {cycles * cycle:g} s"
+            f"{duration:.12g} s is not a whole number of communication cycles of {cycle:g} s; "
+            f"use {cycles * cycle:.12g} s"
         )
     return cycles
 

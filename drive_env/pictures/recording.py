@@ -15,6 +15,7 @@ from drive_env.dictionary import units
 from drive_env.dictionary.codec import decode, encode
 from drive_env.dictionary.entries import ObjectName
 from drive_env.dictionary.roles import Role
+from drive_env.drives.arguments import whole_cycles
 from drive_env.drives.interface import CYCLE
 from drive_env.trials.positioning import wrapped
 from mechanics.arrays import Floats, Integers, Mask
@@ -102,13 +103,7 @@ class Recorder:
 
     def advance(self, duration: float) -> None:
         """Let time pass [s] and record each communication cycle of 1 ms; ValueError for a part of a cycle."""
-        cycles = round(duration / CYCLE)
-        if cycles < 0 or abs(cycles * CYCLE - duration) > 1e-9:
-            raise ValueError(
-                f"{duration:g} s is not a whole number of communication cycles of {CYCLE:g} s; "
-                f"use {max(cycles, 0) * CYCLE:g} s"
-            )
-        for _ in range(cycles):
+        for _ in range(whole_cycles(duration, CYCLE)):
             self._joints.append(self.drives.machine.joint_positions[self._machine])
             self._load_torque.append(float(self.drives.machine.load_torque[self._machine]))
             trace = self.drives.record(self._names, CYCLE)

@@ -50,6 +50,8 @@ def test_time_passes_in_whole_communication_cycles(axis):
     axis.advance(0.0)
     with pytest.raises(ValueError, match=r"0\.0015 s is not a whole number of communication cycles of 0\.001 s"):
         axis.advance(0.0015)
+    with pytest.raises(ValueError, match=r"12345\.6785 s is not .*; use 12345\.678 s"):
+        axis.advance(12345.6785)
     with pytest.raises(ValueError, match="not a whole number"):
         axis.advance(-0.001)
     with pytest.raises(ValueError, match="period must be at least"):
