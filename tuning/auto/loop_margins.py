@@ -16,10 +16,9 @@ from drive_env.fieldbus.errors import BusError
 from drive_env.loops.dynamics import OFF_NOMINAL, find_dynamics
 from drive_env.safety.envelope import SafetyError
 from mechanics.arrays import Integers, Mask
+from tuning.auto.bench import BY_TRIAL
 from tuning.auto.loop_model import LinkedAxis, LoopModel, loop_models, measured_response, one_plant
-from tuning.auto.measured_margins import LOOPS, MeasuredAxis
-from tuning.auto.model_bounds import at_least_by_model, why_unbounded
-from tuning.auto.trying import BY_TRIAL, watch_following
+from tuning.auto.measured_margins import LOOPS, MeasuredAxis, at_least_by_model, why_unbounded
 from tuning.response.measured_loop import merged
 
 if TYPE_CHECKING:
@@ -79,7 +78,7 @@ def measure(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mask
             raise
         return _without_response(recorded, going, str(error))
     finally:
-        watch_following(bench, going)
+        bench.watch_following(going)
     bench.ground.begin_here(going)
     unseen, faults = recorded.unseen.copy(), bench.faults()
     for k in map(int, np.flatnonzero(going)):
