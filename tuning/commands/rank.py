@@ -143,7 +143,6 @@ def _compare(
     from tuning.compare.comparison import compare, so_far
     from tuning.compare.comparison_files import settings_text
     from tuning.compare.oracle import are_kept, find_oracles
-    from tuning.compare.suite import groups
     from tuning.runs import unfinished
     from tuning.runs.inputs import inputs_in
     from tuning.runs.pools import open_pool
@@ -152,7 +151,7 @@ def _compare(
     run_text = settings_text({**settings, "machines": hashlib.sha256(repr(machines).encode()).hexdigest()})
     with unfinished.shard_log(folder, run_text, resume=resume, inputs=inputs_in(settings)) as log:
         if log.done:
-            steps = len(tuners) * len(groups(machines))
+            steps = len(tuners) * len(machines)
             print(f"note: continues a stopped run; {len(log.done)} of {steps} steps are done", file=sys.stderr)
         with open_pool(workers, cluster) as pool:
             for line in pool.differences():
