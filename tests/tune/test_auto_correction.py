@@ -303,6 +303,14 @@ def test_without_drive_time_nothing_is_corrected_and_what_fails_is_rejected(monk
     assert verified == [[1000]] and bench.journals[0].reason == "it swung"
 
 
+@pytest.mark.parametrize(("seconds", "verified"), [(4.9, [[1000]]), (5.0, [[1000], [800]])])
+def test_gains_are_corrected_only_if_time_is_left_to_verify_them_by_trial_move_step_and_response(
+    seconds, verified, monkeypatch
+):
+    _, _, found = corrected(monkeypatch, [800, 800], seconds=seconds, slack=lambda p: 0.9 - p / 1000.0)
+    assert found == verified
+
+
 def test_an_envelope_that_stops_the_trial_of_corrected_gains_leaves_those_before(monkeypatch):
     def run(self, gains, where):
         raise SafetyError("axis 0 oscillates")

@@ -17,7 +17,7 @@ from mechanics.arrays import Floats, Integers, Mask
 from tuning.auto.bench import BY_TRIAL, MOVE_TIME, REDESIGNED, TRIAL_TIME
 from tuning.auto.design import design_axes
 from tuning.auto.loop_margins import MEASURED, OVERSHOOT_ERROR, measure, measured_axis
-from tuning.auto.moves import load, show, step
+from tuning.auto.moves import STEP_TIME, load, show, step
 from tuning.auto.proving import RESTLESS, ProvingGround
 from tuning.auto.stages import RecordedGains
 
@@ -184,7 +184,7 @@ def correct(
                 gains[k] = recorded.gains[k]
         # Change all axes of a machine if one of them gets other gains.
         changed = bench.going & ~bench.whole_machines((gains == recorded.gains).all(axis=1))
-        changed &= bench.affordable(TRIAL_TIME + MOVE_TIME + bench.response_time)
+        changed &= bench.affordable(TRIAL_TIME + MOVE_TIME + STEP_TIME + bench.response_time)
         if not changed.any():
             break
         tried_before.append(gains.copy())
