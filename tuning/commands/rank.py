@@ -148,7 +148,8 @@ def _compare(
     from tuning.runs.pools import open_pool
 
     # The content of the machines is part of the settings, since the suite's file may change.
-    run_text = settings_text({**settings, "machines": hashlib.sha256(repr(machines).encode()).hexdigest()})
+    known = {"machines": hashlib.sha256(repr(machines).encode()).hexdigest(), "steps": "a tuner on a machine"}
+    run_text = settings_text(settings | known)
     with unfinished.shard_log(folder, run_text, resume=resume, inputs=inputs_in(settings)) as log:
         if log.done:
             steps = len(tuners) * len(machines)
