@@ -165,15 +165,17 @@ def test_a_summary_is_of_all_machines():
 
 @pytest.mark.slow
 def test_what_a_tuner_does_not_vouch_for_is_not_accepted():
-    vouched = [True, False, True, True]
-    each = iter(vouched)
+    verdicts = [(True, False), (False, False), (True, True), (True, False)]
+    each = iter(verdicts)
 
     def doubts(target, rng):
-        return outcome(target, read_gains(target.drives))._replace(accepted=np.array([next(each)]))
+        accepted, reserved = map(np.atleast_1d, next(each))
+        return outcome(target, read_gains(target.drives))._replace(accepted=accepted, reserved=reserved)
 
     found = compare(RIGID, {"doubts": doubts, "broken": breaks})
-    assert [row.accepted for row in found.of("doubts")] == vouched
-    assert {row.tuner: row.accepted for row in found.tuners} == {"doubts": 0.75, "broken": 0.0}
+    assert [(row.accepted, row.reserved) for row in found.of("doubts")] == verdicts
+    shares = {row.tuner: (row.accepted, row.reserved) for row in found.tuners}
+    assert shares == {"doubts": (0.75, 0.25), "broken": (0.0, 0.0)}
 
 
 # --- what tuners do -----------------------------------------------------------------------------------------------

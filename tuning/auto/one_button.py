@@ -181,6 +181,7 @@ def tune(target: Target, rng: np.random.Generator, dynamics: str | Dynamics = DE
         found.moves,
         found.aborts,
         found.violations,
-        tuple(axis.reason or "; ".join(axis.notes) for axis in found.axes),
+        tuple(axis.reason or "; ".join([*axis.reservations, *axis.notes]) for axis in found.axes),
         found.accepted,
+        np.array([axis.accepted and bool(axis.reservations) for axis in found.axes]),
     )

@@ -205,12 +205,12 @@ def _print_figures(comparison: Comparison, dynamics: str) -> None:
 
     machines = comparison.tuners[0].machines
     titles = ("median", "p95", "keep\nall", "near", "phase [°]\nmedian, 5 %", "gain\n[dB]", "Ms\nmedian, 95 %",
-              "accepted", "time\n[s]", "violations", "gave\nup")  # fmt: skip
+              "accepted,\nreserved", "time\n[s]", "violations", "gave\nup")  # fmt: skip
     rows = [
         (row.tuner, f"{row.median:.2f}", f"{row.p95:.2f}", _percent(row.kept), _percent(row.near),
          f"{_figure(row.phase_deg, 0)}, {_figure(row.phase_p5, 0)}", _figure(row.gain_db, 1),
-         f"{_figure(row.ms, 2)}, {_figure(row.ms_p95, 1)}", _percent(row.accepted), f"{row.drive_seconds:.2f}",
-         str(row.violations), str(row.failed))
+         f"{_figure(row.ms, 2)}, {_figure(row.ms_p95, 1)}", f"{_percent(row.accepted)}, {_percent(row.reserved)}",
+         f"{row.drive_seconds:.2f}", str(row.violations), str(row.failed))
         for row in comparison.tuners
     ]  # fmt: skip
     title = f"Robust performance over the constrained oracle's on {machines} machines, {dynamics} dynamics"
@@ -218,7 +218,8 @@ def _print_figures(comparison: Comparison, dynamics: str) -> None:
     lines = [
         "keep all: machines on which the gains keep every constraint (margins, variants, csp step, rest). near: true "
         "phase and gain margins are within 5° and 1 dB of those demanded. Margins: true ones of the worst outer loop.",
-        "Ratios below 1 are of gains that break a constraint. Time: median of a machine. Violations, gave up: sum.",
+        "Ratios below 1 are of gains that break a constraint. Reserved: accepted with reservations. Time: median of a "
+        "machine. Violations, gave up: sum.",
     ]
     for row in all_rivals(comparison):
         lines.append(

@@ -52,7 +52,8 @@ class MachineRow:
         model, as the margins.
     phase_deg, gain_db, ms: True margins of the worst outer loop; 0, 0 and 100 for an unstable machine.
     near: Whether phase and gain margin are at most 5 degrees and 1 dB below those demanded.
-    accepted: Whether the tuner guarantees the gains.
+    accepted: Whether the tuner accepts the gains.
+    reserved: Whether it accepts them with reservations, so that it does not guarantee them.
     drive_seconds: Time until the drive was last written to or moved [s].
     moves: Moves of all axes, each from standstill to standstill (move_counter.py).
     aborts: As counted by the tuner.
@@ -74,6 +75,7 @@ class MachineRow:
     ms: float | None
     near: bool
     accepted: bool
+    reserved: bool
     drive_seconds: float
     moves: int
     aborts: int
@@ -98,7 +100,7 @@ class TunerRow:
     near: Share of machines whose true phase and gain margins are at most 5 degrees and 1 dB below those demanded.
     phase_deg, phase_p5, gain_db, ms, ms_p95: Margins of a machine's worst outer loop: phase (median and 5th
         percentile), gain (median), Ms (median and 95th percentile); None if no drive has a linear model.
-    accepted: Share of machines whose gains the tuner guarantees.
+    accepted, reserved: Shares of machines whose gains the tuner accepts, and accepts with reservations.
     drive_seconds, moves: Medians over machines.
     aborts, violations: Sums over all machines.
     failed: Number of machines on which the tuner raised an error.
@@ -116,6 +118,7 @@ class TunerRow:
     ms: float | None
     ms_p95: float | None
     accepted: float
+    reserved: float
     drive_seconds: float
     moves: float
     aborts: int
@@ -315,6 +318,7 @@ class _Bench:
         scores, worst = self._yardstick.score(gains), self._yardstick.margins(gains)
         asked, oracle = self._yardstick.dynamics, self.task.oracle.performance
         counts = audit.violations.sum(axis=1)
+        accepted = outcome is not None and (outcome.accepted is None or bool(np.all(outcome.accepted)))
         notes = [failure] if outcome is None else [note for note in outcome.notes if note]
         phase, gain, ms, slack = (
             float(value[0]) if np.isfinite(value[0]) else None for value in (*worst, scores.slack)
@@ -332,7 +336,8 @@ class _Bench:
             ms=ms,
             near=(phase is None or phase >= asked.phase_deg - NEAR_PHASE)
             and (gain is None or gain >= asked.gain_db - NEAR_GAIN),
-            accepted=outcome is not None and (outcome.accepted is None or bool(np.all(outcome.accepted))),
+            accepted=accepted,
+            reserved=accepted and outcome is not None and outcome.reserved is not None and bool(outcome.reserved.any()),
             drive_seconds=round(float(audit.seconds.max()), 3),
             moves=int(audit.moves.sum()),
             aborts=0 if outcome is None else int(outcome.aborts.sum()),
@@ -374,6 +379,7 @@ def _summary(name: str, rows: Sequence[MachineRow]) -> TunerRow:
         ms=percentile("ms", 50),
         ms_p95=percentile("ms", 95),
         accepted=float(np.mean([row.accepted for row in rows])),
+        reserved=float(np.mean([row.reserved for row in rows])),
         drive_seconds=float(np.median([row.drive_seconds for row in rows])),
         moves=float(np.median([row.moves for row in rows])),
         aborts=sum(row.aborts for row in rows),
