@@ -11,7 +11,7 @@ from drive_env.loops.dynamics import DEFAULT
 if TYPE_CHECKING:
     from drive_env.loops.dynamics import Dynamics
     from tuning.auto.one_button import Method
-    from tuning.auto.result import Result
+    from tuning.auto.stages import Result
     from tuning.stepper.result import StepperResult
     from tuning.target import Target
 

@@ -21,6 +21,7 @@ class Outcome(NamedTuple):
     violations: Number of violations of limits, shape (num_axes,).
     notes: One text per axis, "" without a note.
     accepted: Axes whose gains the tuner guarantees, shape (num_axes,); None means all.
+    reserved: Accepted axes with reservations: not every check could be made or passed, (num_axes,); None means none.
     """
 
     gains: Integers
@@ -30,6 +31,7 @@ class Outcome(NamedTuple):
     violations: Integers
     notes: tuple[str, ...]
     accepted: Mask | None = None
+    reserved: Mask | None = None
 
 
 Tuner = Callable[[Target, np.random.Generator], Outcome]

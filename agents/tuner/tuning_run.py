@@ -51,8 +51,9 @@ def make_trials(bench: AutoBench, basis: Basis, policy: Any, show: Callable[[Tri
 
     from agents.tuner.kept_margins import KeptMargins
     from drive_env.safety.envelope import SafetyError, swinging_allowed
+    from tuning.auto.bench import BY_TRIAL
+    from tuning.auto.correction import proving_ground
     from tuning.auto.stages import RecordedGains
-    from tuning.auto.trying import BY_TRIAL, proving_ground, watch_following
 
     target, going = bench.target, bench.going
     if not going.all():
@@ -73,7 +74,7 @@ def make_trials(bench: AutoBench, basis: Basis, policy: Any, show: Callable[[Tri
     ground = proving_ground(bench, basis)
     ground.aborts += np.repeat(np.sum([trial.aborted for trial in tuned.trials], axis=0), lanes)
     ground.moves += tuned.moves
-    watch_following(bench, going)
+    bench.watch_following(going)
     proof, verified = tried.proof.copy(), tried.verified.copy()
     for machine in range(target.num_axes // lanes):
         own = slice(machine * lanes, (machine + 1) * lanes)

@@ -60,5 +60,5 @@ def skip_stages(replace, gains):
     replace(one_button, "prepare", lambda bench, identified: basis(gains, before=bench.before))
     replace(one_button, "on_twins", lambda bench, basis, say: RecordedGains.only(gains.copy()))
     replace(one_button, "correct", lambda bench, basis, tried, target, say, improves: tried)
-    replace(one_button, "look_back", lambda bench, basis, recorded: recorded)
+    replace(one_button, "record_previous_gains", lambda bench, basis, recorded: recorded)
     replace(one_button, "judge", lambda bench, basis, recorded: recorded)

@@ -21,7 +21,7 @@ from drive_env.studio import motion_jobs
 from drive_env.studio.errors import JobEndedError
 from drive_env.studio.session import Session
 from tuning.auto.proving import Shown
-from tuning.auto.result import AxisResult, Result
+from tuning.auto.stages import AxisResult, Result
 from tuning.response.measured_loop import Loops
 from tuning.snapshot import load_snapshot, take_of
 from tuning.studio import gain_card, response_card, response_charts, step_card, tune_jobs

@@ -31,7 +31,6 @@ from drive_env.trials.score import RobustScore
 from tuning.auto import correction
 from tuning.auto import identified as auto_identified
 from tuning.auto import one_button as auto_module
-from tuning.auto import trying as auto_trying
 from tuning.auto.certify import SETTLING, certificate
 from tuning.auto.identified import unsafe_gains
 from tuning.auto.loop_margins import MS_ERROR
@@ -276,7 +275,7 @@ def test_whatever_ends_it_the_gains_before_are_back(quick_designs, monkeypatch, 
 def test_gains_that_fail_every_trial_are_rolled_back_with_the_last_reason(quick_designs, monkeypatch, tmp_path):
     designs(monkeypatch.setattr, [4021, 1573, 32767, 32767, 32767])
     monkeypatch.setattr(auto_identified, "calm_gains", lambda target, plant: np.full(5, 32767))
-    monkeypatch.setattr(auto_trying, "faster", lambda known, gains, factor: np.full_like(gains, 32767))
+    monkeypatch.setattr(correction, "faster", lambda known, gains, factor: np.full_like(gains, 32767))
     with emulated(load="inertia", num_threads=1) as target:
         before = np.array([[4021, 1573, 445, 329, 0]])  # no way back to gains that would pass
         write_gains(target.drives, before)

@@ -169,7 +169,7 @@ def test_what_a_move_shows_is_corrected_too(monkeypatch):
 def test_soft_dynamics_are_asked_where_a_response_was_looked_for_and_not_seen(failed, asked, monkeypatch):
     """What failed its move has no response yet: that says nothing of its loops."""
     first = {"failed": lambda p: failed if p == 1000 else ""}
-    _, bench, _ = corrected(monkeypatch, [800] * 6, measured=False, slack=lambda p: 0.5, **first)
+    _, bench, _ = corrected(monkeypatch, [800] * 6, measured=False, slack=lambda p: np.nan, **first)
     assert bench.asked[0] == asked
 
 
@@ -301,6 +301,14 @@ def test_an_axis_that_no_correction_helps_is_rejected_with_its_reason(monkeypatc
 def test_without_drive_time_nothing_is_corrected_and_what_fails_is_rejected(monkeypatch):
     _, bench, verified = corrected(monkeypatch, [900, 800], failed=lambda p: "it swung", seconds=1.0)
     assert verified == [[1000]] and bench.journals[0].reason == "it swung"
+
+
+@pytest.mark.parametrize(("seconds", "verified"), [(4.9, [[1000]]), (5.0, [[1000], [800]])])
+def test_gains_are_corrected_only_if_time_is_left_to_verify_them_by_trial_move_step_and_response(
+    seconds, verified, monkeypatch
+):
+    _, _, found = corrected(monkeypatch, [800, 800], seconds=seconds, slack=lambda p: 0.9 - p / 1000.0)
+    assert found == verified
 
 
 def test_an_envelope_that_stops_the_trial_of_corrected_gains_leaves_those_before(monkeypatch):

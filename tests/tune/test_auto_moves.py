@@ -25,13 +25,11 @@ from tuning.auto import one_button as auto_module
 from tuning.auto import proving as proving_module
 from tuning.auto.bench import Journal
 from tuning.auto.certify import certificate
-from tuning.auto.correction import CORRECTIONS
+from tuning.auto.correction import CORRECTIONS, faster
 from tuning.auto.identified import calm_gains
-from tuning.auto.load_step import NOISE, SWING, load_step
-from tuning.auto.moves import keep_what_is_better
+from tuning.auto.moves import NOISE, SWING, keep_what_is_better, load_step
 from tuning.auto.one_button import Method, auto, tell_of_lateness
 from tuning.auto.proving import RESTLESS, ProvingGround, Shown, without_noise
-from tuning.auto.trying import faster
 from tuning.estimate import Estimate, refused
 from tuning.identify.identified_axis import Identification
 from tuning.identify.moved_inertia import moved_inertia

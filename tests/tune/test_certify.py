@@ -17,7 +17,7 @@ from drive_env.loops.sampled import CascadeGains, LoopRates, open_loops
 from drive_env.loops.true_plant import true_machines
 from tuning.auto.certify import certificate, requirements
 from tuning.auto.measured_margins import MeasuredAxis
-from tuning.auto.result import AxisResult, Result
+from tuning.auto.stages import AxisResult, Result
 from tuning.certificate.certificate import CROSSOVERS, KEPT, NEARLY_KEPT, NOT_KEPT, NOT_MEASURED, SEEN_KEPT
 from tuning.response import frequency_response
 from tuning.response.measured_loop import AtLeast

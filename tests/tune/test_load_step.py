@@ -12,8 +12,8 @@ from drive_env import motion
 from drive_env.devices.gains import gains_in_si
 from drive_env.drives.raw_gains import write_gains
 from mechanics.shaft import one, way
-from tuning.auto import load_step as module
-from tuning.auto.load_step import BEFORE, NAME, load_step
+from tuning.auto import moves as module
+from tuning.auto.moves import BEFORE, NAME, load_step
 from tuning.target import emulated
 
 TURN = 2.0 * np.pi

@@ -12,7 +12,7 @@ from rigs.known_machines import true_plant
 from drive_env.loops.linear_model import OPEN_LOOPS, Plant
 from drive_env.loops.margins import margins
 from tuning.auto.certify import certificate
-from tuning.auto.model_bounds import at_least_by_model, why_unbounded
+from tuning.auto.measured_margins import at_least_by_model, why_unbounded
 from tuning.auto.one_button import Method, auto
 from tuning.certificate.report import to_html
 from tuning.commands.auto import _margins

@@ -14,6 +14,7 @@ import numpy as np
 
 from drive_env import cia402
 from drive_env.cia402 import Key
+from drive_env.dictionary.roles import Role
 from drive_env.drives.raw_gains import read_gains
 from mechanics.arrays import Floats, Integers, Mask
 from tuning.certificate.certificate import TAKEN, Correction
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
 # move that begins where a response has ended.
 RESPONSE_TIME, TRIAL_TIME, MOVE_TIME, PREVIOUS_GAINS_TIME = 2.3, 0.85, 0.8, 1.3
 
+BY_TRIAL = "by a move, its reversal, and a move with 1.5 times velocity P"  # how gains are verified at least
+WINDOW = 10  # following error that trips a trial, over its move: a slow loop lags by the whole move
 REDESIGNED = "gains designed again from what was measured: "  # first words of the note on such gains
 
 
@@ -164,6 +167,12 @@ class AutoBench:
         faulted = self.going & cia402.matches(drives.read(cia402.STATUSWORD), cia402.FAULT_BIT)
         causes = stop_causes(drives)
         return {axis: causes[axis] for axis in map(int, np.flatnonzero(faulted))}
+
+    def watch_following(self, where: Mask) -> None:
+        """Set a following error window that no normal trial exceeds."""
+        drives = self.target.drives
+        window = WINDOW * np.abs(self.ground.move.distance) + drives.read(Role.POSITION_SCALE)
+        drives.write(cia402.FOLLOWING_WINDOW, window, where=where)
 
     def recover(self, where: Mask) -> None:
         """Reset faults of axes, and hold them with stable gains."""

@@ -10,9 +10,9 @@ from drive_env.devices.gain_set import FEED_FORWARD
 from drive_env.loops.linear_model import OPEN_LOOPS
 from drive_env.loops.margins import Margins, margins
 from mechanics.arrays import Floats
-from tuning.auto.load_step import NOISE, SWING
 from tuning.auto.loop_margins import OVERSHOOT_ERROR, AskedMargin, asked_margins
 from tuning.auto.measured_margins import LOOPS
+from tuning.auto.moves import NOISE, SWING
 from tuning.certificate.certificate import (
     CROSSOVERS,
     KEPT,
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from drive_env.devices.gain_set import GainSet
     from drive_env.loops.dynamics import Dynamics
     from tuning.auto.proving import Shown
-    from tuning.auto.result import AxisResult, Result
+    from tuning.auto.stages import AxisResult, Result
     from tuning.target import Target
 
 # Margins of a loop that was not measured.

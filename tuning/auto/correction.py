@@ -1,4 +1,4 @@
-"""Verifies gains on the drives, and designs them again from the measurements, at most twice."""
+"""Tries designed gains on the drives, verifies them, and designs them again from the measurements, at most twice."""
 
 from __future__ import annotations
 
@@ -9,25 +9,27 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drive_env.devices.gains import cascade_columns
+from drive_env.drives.raw_gains import write_gains
 from drive_env.loops.dynamics import find_dynamics
 from drive_env.safety.envelope import SafetyError
 from drive_env.trials.score import TRIP, robust_cost
 from mechanics.arrays import Floats, Integers, Mask
-from tuning.auto.bench import MOVE_TIME, REDESIGNED, TRIAL_TIME
+from tuning.auto.bench import BY_TRIAL, MOVE_TIME, REDESIGNED, TRIAL_TIME
 from tuning.auto.design import design_axes
 from tuning.auto.loop_margins import MEASURED, OVERSHOOT_ERROR, measure, measured_axis
-from tuning.auto.moves import load, record_final_move, step
-from tuning.auto.proving import RESTLESS
+from tuning.auto.moves import STEP_TIME, load, record_final_move, step
+from tuning.auto.proving import RESTLESS, ProvingGround
 from tuning.auto.stages import RecordedGains
-from tuning.auto.trying import between
 
 if TYPE_CHECKING:
+    from drive_env.devices.gain_set import GainSet
     from tuning.auto.bench import AutoBench
     from tuning.auto.stages import Basis
     from tuning.target import Target
 
+SLOWER = 0.6  # factor by which gains that fail their trial are lowered
 CORRECTIONS = 2
-UNSEEN = "no loop was measured, so soft dynamics are asked of the model"
+UNSEEN = "not all margins were measured, so soft dynamics are asked of the model"
 NO_BETTER = "no better as measured: the old ones stay"
 WORTH = 0.85  # of the robust cost on the twins: a smaller improvement is not worth a correction
 SAME = 0.05  # relative difference of cost that two trials of the same gains may have
@@ -37,6 +39,76 @@ CALMER, LEAST_CALMER = 0.9, 0.5
 # Factors of velocity P, velocity I and position P for lowered gains, if no time is left to design new ones.
 LOWERED = np.array([(v, i, p) for v in (1.0, 0.85, 0.7, 0.55, 0.4, 0.25) for i in (1.0, 0.7, 0.5, 0.3)
                     for p in (1.0, 0.85, 0.7, 0.55, 0.4, 0.25, 0.15)])  # fmt: skip
+
+
+def try_gains(bench: AutoBench, basis: Basis, gains: Integers, cost: Floats) -> RecordedGains:
+    """Try designed gains on the drives; if they fail, lowered ones, then gains that are slow enough for any load.
+
+    Args:
+        bench: The drives.
+        basis: The identified axes, with calm gains.
+        gains: Designed gains, (num_axes, count).
+        cost: Their robust cost on the digital twins, (num_axes,).
+    """
+    ground, n = proving_ground(bench, basis), bench.target.num_axes
+    bench.watch_following(bench.going)
+    bench.stop(bench.going & ground.too_short(), "the travel is too short for a trial move")
+    known = bench.target.device.gains
+    # Position P is lowered most: on an axis with more inertia than identified its loop would be too fast for the inner
+    # one.
+    slower = known.scaled(faster(known, gains, SLOWER), SLOWER, known.columns_of("position"))
+    best, proof, last = basis.calm.copy(), np.full(n, np.nan), [""] * n
+    stopped = np.zeros(n, bool)  # with the designed gains
+    attempts = (
+        ("the designed gains", gains),
+        (f"these lowered to {100.0 * SLOWER:.0f} %", slower),
+        ("gains that are slow enough for any load", basis.calm),
+    )
+    for words, tried in attempts:
+        bench.recover_faults(bench.faults(), "gains were tried")
+        open_ = bench.going & np.isnan(proof) & bench.affordable(TRIAL_TIME + ground.way_back())
+        if not open_.any():
+            break
+        write_gains(bench.target.drives, best, bench.going & ~open_)
+        with bench.spending(bench.target.together(open_)):
+            found = ground.run(np.where(open_[:, None], tried, best), open_)
+        passed = bench.whole_machines(found.passed | ~open_) & open_
+        best = np.where(passed[:, None], tried, best)
+        proof = np.where(passed, found.cost, proof)
+        stopped |= open_ & found.stopped & (tried is gains)
+        for k in map(int, np.flatnonzero(open_)):
+            journal = bench.journals[k]
+            if not passed[k]:
+                last[k] = found.reason[k] or "another axis of its machine did not pass"
+                if tried is not basis.calm:
+                    journal.note(f"{words} failed their trial: {last[k]}")
+            elif tried is not gains:
+                journal.correct(gains[k], tried[k], f"the designed gains failed their trial: {last[k]}")
+    for k in map(int, np.flatnonzero(bench.going & np.isnan(proof))):
+        why = last[k] or "there was no drive time left to try them"
+        bench.journals[k].stop(f"no gains passed the trial; the last ones: {why}")
+    verified = np.where(bench.going, BY_TRIAL, "").astype(object)
+    cost = np.where((best == gains).all(axis=1), cost, np.nan)
+    most = np.where(stopped, between(known, best, gains), np.inf)
+    return replace(RecordedGains.only(best), proof=proof, verified=verified, cost=cost, most=most)
+
+
+def proving_ground(bench: AutoBench, basis: Basis) -> ProvingGround:
+    """Create the proving ground with the present positions of the axes, and store it in the bench."""
+    plants = basis.identified.plants
+    bench.ground = ProvingGround(bench.target, plants, bench.room(), basis.calm, basis.reference, basis.held())
+    return bench.ground
+
+
+def between(known: GainSet, passed: Integers, stopped: Integers) -> Floats:
+    """Return the velocity P half way between gains that passed a trial and stopped ones, raw, (num_axes,)."""
+    column = known.column("velocity", "P")
+    return np.asarray(np.floor(np.sqrt(passed[:, column].astype(float) * stopped[:, column])))
+
+
+def faster(known: GainSet, gains: Integers, factor: float) -> Integers:
+    """Scale the outer loops' gains, of shape (..., count), by a factor."""
+    return known.scaled(gains, factor, known.columns_of("velocity", "position"))
 
 
 def _most_velocity_p(bench: AutoBench, best: RecordedGains | None, recorded: RecordedGains) -> Floats:
@@ -112,7 +184,7 @@ def correct(
                 gains[k] = recorded.gains[k]
         # Change all axes of a machine if one of them gets other gains.
         changed = bench.going & ~bench.whole_machines((gains == recorded.gains).all(axis=1))
-        changed &= bench.affordable(TRIAL_TIME + MOVE_TIME + bench.response_time)
+        changed &= bench.affordable(TRIAL_TIME + MOVE_TIME + STEP_TIME + bench.response_time)
         if not changed.any():
             break
         tried_before.append(gains.copy())
@@ -152,8 +224,7 @@ def _corrected(
                 gains[k] = _lowered(bench, basis, recorded, k, float(most[k]))
         return gains, why
     # Loops were not measured on machines that failed their move; axes whose measurement failed get more margin.
-    looked_at = bench.going & bench.whole_machines(recorded.failed == "")
-    blind = looked_at & np.array([measured_axis(bench, basis, recorded, k) is None for k in range(len(gains))])
+    blind = bench.going & bench.whole_machines(recorded.failed == "") & np.isnan(recorded.slack)
     if not worth and not blind.any() and not any(_short(bench, recorded, int(k)) for k in np.flatnonzero(bench.going)):
         return gains, why
     designed, cost, present = design_axes(bench, basis, bench.going & ~blind, recorded=recorded, most=most)

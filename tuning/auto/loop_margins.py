@@ -16,10 +16,9 @@ from drive_env.fieldbus.errors import BusError
 from drive_env.loops.dynamics import OFF_NOMINAL, find_dynamics
 from drive_env.safety.envelope import SafetyError
 from mechanics.arrays import Integers, Mask
+from tuning.auto.bench import BY_TRIAL
 from tuning.auto.loop_model import LinkedAxis, LoopModel, loop_models, measured_response, one_plant
-from tuning.auto.measured_margins import LOOPS, MeasuredAxis
-from tuning.auto.model_bounds import at_least_by_model, why_unbounded
-from tuning.auto.trying import BY_TRIAL, watch_following
+from tuning.auto.measured_margins import LOOPS, MeasuredAxis, at_least_by_model, why_unbounded
 from tuning.response.measured_loop import merged
 
 if TYPE_CHECKING:
@@ -79,7 +78,7 @@ def measure(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mask
             raise
         return _without_response(recorded, going, str(error))
     finally:
-        watch_following(bench, going)
+        bench.watch_following(going)
     bench.ground.begin_here(going)
     unseen, faults = recorded.unseen.copy(), bench.faults()
     for k in map(int, np.flatnonzero(going)):
@@ -104,11 +103,15 @@ def measure(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mask
 
 
 def _with_slack(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mask) -> RecordedGains:
-    """Add the slack of the axes' loops to the dynamics; nan if they were not measured."""
+    """Add the slack of the axes' loops to the dynamics; nan if not all margins were measured, and none is short."""
     slack = recorded.slack.copy()
     for k in map(int, np.flatnonzero(where)):
         one = measured_axis(bench, basis, recorded, k)
         slack[k] = np.nan if one is None else one.slack(bench.dynamics, recorded.gains[k][None])[0]
+        if isinstance(one, MeasuredAxis) and slack[k] >= 0.0 and recorded.response is not None:
+            own = recorded.gains[k]
+            least = {loop: recorded.response.at_least(loop, own, k) for loop in LOOPS}
+            slack[k] = np.nan if _unseen_loops(least, one.margins(own)) else slack[k]
     return replace(recorded, slack=slack)
 
 
@@ -235,15 +238,11 @@ def _told_bounds(
     bench: AutoBench, basis: Basis, k: int, gains: Integers, response: MeasuredLoop, found: Mapping[str, Margins]
 ) -> dict[str, AtLeast]:
     """Return lower bounds of an axis' margins, and report those that replace a margin that was not measured."""
-    journal, least, blank = bench.journals[k], {loop: response.at_least(loop, gains, k) for loop in LOOPS}, []
-    for loop, one in least.items():
-        # Loops with a margin that was not measured, and that the response gives no bound for.
-        if any(
-            math.isnan(getattr(one, name)) and not math.isfinite(getattr(found[loop], name)) for name in one._fields
-        ):
-            blank.append(loop)
-        else:
-            tell_bounds(journal, bench.dynamics, loop, found[loop], one)
+    journal, least = bench.journals[k], {loop: response.at_least(loop, gains, k) for loop in LOOPS}
+    blank = _unseen_loops(least, found)
+    for loop in LOOPS:
+        if loop not in blank:
+            tell_bounds(journal, bench.dynamics, loop, found[loop], least[loop])
     if blank:
         more, bounds = _by_model(bench, basis, k, gains, blank)
         least |= more
@@ -252,6 +251,14 @@ def _told_bounds(
             f"and the response fits no model; {bounds}"
         )
     return least
+
+
+def _unseen_loops(least: Mapping[str, AtLeast], found: Mapping[str, Margins]) -> list[str]:
+    """Return the loops with a margin that was not measured, and that the response gives no bound for."""
+    return [
+        loop for loop, one in least.items()
+        if any(math.isnan(getattr(one, name)) and not math.isfinite(getattr(found[loop], name)) for name in one._fields)
+    ]  # fmt: skip
 
 
 def tell_overshoot(bench: AutoBench, journal: Journal, overshoot: float) -> None:

@@ -7,9 +7,9 @@ back. Gains are designed on digital twins, which takes no drive time, and correc
 
 1. identify: identified.py, with the wiring and the motor's parameters (settings.py);
 2. design: design.py, on twins (twin.py) and their linear models (loop_model.py);
-3. try: trying.py, in trials on the drives (proving.py);
-4. verify and correct: correction.py, by moves (moves.py) and measured loops (loop_margins.py, measured_margins.py);
-5. certify: certify.py, of the result (result.py).
+3. try, 4. verify and correct: correction.py, in trials (proving.py), by moves (moves.py) and by measured loops
+   (loop_margins.py, measured_margins.py);
+5. certify: certify.py.
 """
 
 from __future__ import annotations
@@ -26,15 +26,13 @@ from drive_env.devices.gains import check_linear_model
 from drive_env.loops.dynamics import DEFAULT, INERTIA_RANGE, Dynamics, find_dynamics
 from drive_env.trials.demand import COMPUTED, is_recorded
 from tuning.auto.bench import AutoBench
-from tuning.auto.correction import correct
+from tuning.auto.correction import correct, try_gains
 from tuning.auto.design import design_axes
 from tuning.auto.identified import identify, prepare
 from tuning.auto.loop_margins import judge
 from tuning.auto.moves import record_previous_gains
-from tuning.auto.result import collect
 from tuning.auto.settings import begin, commission, write
-from tuning.auto.stages import Basis, RecordedGains
-from tuning.auto.trying import try_gains
+from tuning.auto.stages import Basis, RecordedGains, collect
 from tuning.identify.quick_identification import identify_briefly
 from tuning.lateness import told_lateness
 from tuning.outcome import Outcome
@@ -44,7 +42,7 @@ from tuning.target import timed
 
 if TYPE_CHECKING:
     from tuning.auto.identified import Identify
-    from tuning.auto.result import Result
+    from tuning.auto.stages import Result
     from tuning.target import Target
 
 Progress = Callable[[str, float], None]  # the present step, and the share of the run that is done, 0...1
@@ -183,6 +181,7 @@ def tune(target: Target, rng: np.random.Generator, dynamics: str | Dynamics = DE
         found.moves,
         found.aborts,
         found.violations,
-        tuple(axis.reason or "; ".join(axis.notes) for axis in found.axes),
+        tuple(axis.reason or "; ".join([*axis.reservations, *axis.notes]) for axis in found.axes),
         found.accepted,
+        np.array([axis.accepted and bool(axis.reservations) for axis in found.axes]),
     )

@@ -29,7 +29,7 @@ from tuning.commands.options import (
 
 if TYPE_CHECKING:
     from drive_env.loops.dynamics import Dynamics
-    from tuning.auto.result import AxisResult, Result
+    from tuning.auto.stages import AxisResult, Result
     from tuning.stepper.result import StepperResult
     from tuning.target import Target
 

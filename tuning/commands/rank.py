@@ -143,16 +143,16 @@ def _compare(
     from tuning.compare.comparison import compare, so_far
     from tuning.compare.comparison_files import settings_text
     from tuning.compare.oracle import are_kept, find_oracles
-    from tuning.compare.suite import groups
     from tuning.runs import unfinished
     from tuning.runs.inputs import inputs_in
     from tuning.runs.pools import open_pool
 
     # The content of the machines is part of the settings, since the suite's file may change.
-    run_text = settings_text({**settings, "machines": hashlib.sha256(repr(machines).encode()).hexdigest()})
+    known = {"machines": hashlib.sha256(repr(machines).encode()).hexdigest(), "steps": "a tuner on a machine"}
+    run_text = settings_text({**settings, **known})
     with unfinished.shard_log(folder, run_text, resume=resume, inputs=inputs_in(settings)) as log:
         if log.done:
-            steps = len(tuners) * len(groups(machines))
+            steps = len(tuners) * len(machines)
             print(f"note: continues a stopped run; {len(log.done)} of {steps} steps are done", file=sys.stderr)
         with open_pool(workers, cluster) as pool:
             for line in pool.differences():
@@ -205,12 +205,12 @@ def _print_figures(comparison: Comparison, dynamics: str) -> None:
 
     machines = comparison.tuners[0].machines
     titles = ("median", "p95", "keep\nall", "near", "phase [°]\nmedian, 5 %", "gain\n[dB]", "Ms\nmedian, 95 %",
-              "accepted", "time\n[s]", "violations", "gave\nup")  # fmt: skip
+              "accepted,\nreserved", "time\n[s]", "violations", "gave\nup")  # fmt: skip
     rows = [
         (row.tuner, f"{row.median:.2f}", f"{row.p95:.2f}", _percent(row.kept), _percent(row.near),
          f"{_figure(row.phase_deg, 0)}, {_figure(row.phase_p5, 0)}", _figure(row.gain_db, 1),
-         f"{_figure(row.ms, 2)}, {_figure(row.ms_p95, 1)}", _percent(row.accepted), f"{row.drive_seconds:.2f}",
-         str(row.violations), str(row.failed))
+         f"{_figure(row.ms, 2)}, {_figure(row.ms_p95, 1)}", f"{_percent(row.accepted)}, {_percent(row.reserved)}",
+         f"{row.drive_seconds:.2f}", str(row.violations), str(row.failed))
         for row in comparison.tuners
     ]  # fmt: skip
     title = f"Robust performance over the constrained oracle's on {machines} machines, {dynamics} dynamics"
@@ -218,7 +218,8 @@ def _print_figures(comparison: Comparison, dynamics: str) -> None:
     lines = [
         "keep all: machines on which the gains keep every constraint (margins, variants, csp step, rest). near: true "
         "phase and gain margins are within 5° and 1 dB of those demanded. Margins: true ones of the worst outer loop.",
-        "Ratios below 1 are of gains that break a constraint. Time: median of a machine. Violations, gave up: sum.",
+        "Ratios below 1 are of gains that break a constraint. Reserved: accepted with reservations. Time: median of a "
+        "machine. Violations, gave up: sum.",
     ]
     for row in all_rivals(comparison):
         lines.append(

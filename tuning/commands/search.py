@@ -141,8 +141,8 @@ class SearchRun:
     def _find(self, folder: Path, bench: AutoBench, basis: Basis, say: Progress) -> RecordedGains:
         import numpy as np
 
+        from tuning.auto.correction import try_gains
         from tuning.auto.stages import RecordedGains
-        from tuning.auto.trying import try_gains
 
         target, every = bench.target, np.ones(bench.target.num_axes, bool)
         if not bench.going.all():

@@ -20,7 +20,7 @@ from tuning.target import hold_to_travel
 if TYPE_CHECKING:
     from drive_env.cia402 import Key
     from drive_env.loops.dynamics import Dynamics
-    from tuning.auto.result import Result
+    from tuning.auto.stages import Result
     from tuning.stepper.result import StepperResult
     from tuning.target import Target
 

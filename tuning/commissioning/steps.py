@@ -38,7 +38,7 @@ from tuning.target import Target
 
 if TYPE_CHECKING:
     from mechanics.arrays import Mask
-    from tuning.auto.result import AxisResult, Result
+    from tuning.auto.stages import AxisResult, Result
     from tuning.identify.identified_axis import Identification
     from tuning.stepper.result import StepperAxis, StepperResult
 
@@ -240,7 +240,7 @@ def store_parameters(bench: CommissioningBench, say: Say) -> list[str]:
 def certify(bench: CommissioningBench, say: Say) -> list[str]:
     """Write the certificate of the tuning, with the information whether it was stored."""
     from tuning.auto.certify import certificate
-    from tuning.auto.result import Result
+    from tuning.auto.stages import Result
     from tuning.certificate.certificate_files import certificate_files
     from tuning.stepper.result import CERTIFICATE, certificate_file
 

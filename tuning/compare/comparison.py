@@ -23,7 +23,7 @@ from drive_env.loops.dynamics import DEFAULT
 from mechanics.arrays import Integers
 from mechanics.reading.untrusted import parse_json
 from tuning.compare.oracle import Oracle, find_oracles
-from tuning.compare.suite import SuiteMachine, groups, open_group
+from tuning.compare.suite import SuiteMachine, open_group
 from tuning.compare.tuners import RuleTuner, find_tuner, identify_all
 from tuning.compare.yardstick import Yardstick
 from tuning.drive_audit import KINDS, DriveAudit
@@ -52,8 +52,9 @@ class MachineRow:
         model, as the margins.
     phase_deg, gain_db, ms: True margins of the worst outer loop; 0, 0 and 100 for an unstable machine.
     near: Whether phase and gain margin are at most 5 degrees and 1 dB below those demanded.
-    accepted: Whether the tuner guarantees the gains.
-    drive_seconds: Time until the drive was last written to or moved [s], with waiting for the machines tuned together.
+    accepted: Whether the tuner accepts the gains.
+    reserved: Whether it accepts them with reservations, so that it does not guarantee them.
+    drive_seconds: Time until the drive was last written to or moved [s].
     moves: Moves of all axes, each from standstill to standstill (move_counter.py).
     aborts: As counted by the tuner.
     violations: Violations of all kinds; `kinds` lists them as text.
@@ -74,6 +75,7 @@ class MachineRow:
     ms: float | None
     near: bool
     accepted: bool
+    reserved: bool
     drive_seconds: float
     moves: int
     aborts: int
@@ -98,7 +100,7 @@ class TunerRow:
     near: Share of machines whose true phase and gain margins are at most 5 degrees and 1 dB below those demanded.
     phase_deg, phase_p5, gain_db, ms, ms_p95: Margins of a machine's worst outer loop: phase (median and 5th
         percentile), gain (median), Ms (median and 95th percentile); None if no drive has a linear model.
-    accepted: Share of machines whose gains the tuner guarantees.
+    accepted, reserved: Shares of machines whose gains the tuner accepts, and accepts with reservations.
     drive_seconds, moves: Medians over machines.
     aborts, violations: Sums over all machines.
     failed: Number of machines on which the tuner raised an error.
@@ -116,6 +118,7 @@ class TunerRow:
     ms: float | None
     ms_p95: float | None
     accepted: float
+    reserved: float
     drive_seconds: float
     moves: float
     aborts: int
@@ -162,22 +165,20 @@ def compare(
         dynamics: Requirements on the loops by which gains are judged.
     """
     best = find_oracles(machines, dynamics=dynamics) if oracles is None else oracles
-    kinds = [[machines[index] for index in indices] for indices in groups(machines)]
     tasks = [
-        _Task(group, [best[machine.name] for machine in group], seed, dynamics, name, trials)
-        for group in kinds for name in tuners
-    ]  # fmt: skip
+        _Task(machine, best[machine.name], seed, dynamics, name, trials) for machine in machines for name in tuners
+    ]
     done = _rows_in(log)
     left = [k for k in range(len(tasks)) if k not in done]
 
     def say(task: _Task) -> None:
-        progress(f"{task.tuner} on {task.group[0].load}, {task.group[0].motor}", len(done) / len(tasks))
+        progress(f"{task.tuner} on {task.machine.name}", len(done) / len(tasks))
 
     fresh = _here(tasks, left, tuners, say) if pool is None else _elsewhere(tasks, left, pool, say)
-    for k, rows in fresh:
-        done[k] = rows
+    for k, row in fresh:
+        done[k] = row
         if log is not None:
-            log.append(k, {"rows": np.array(_text_of(rows))})
+            log.append(k, {"row": np.array(_text_of(row))})
     progress("", 1.0)
     found = _compared(machines, list(tuners), done)
     assert found is not None, "all tasks are done"
@@ -190,10 +191,10 @@ def so_far(machines: Sequence[SuiteMachine], tuners: Sequence[str], log: ShardLo
 
 
 def _compared(
-    machines: Sequence[SuiteMachine], tuners: Sequence[str], done: Mapping[int, Sequence[MachineRow]]
+    machines: Sequence[SuiteMachine], tuners: Sequence[str], done: Mapping[int, MachineRow]
 ) -> Comparison | None:
     """Compare by the rows of finished tasks, on the machines that all tuners have tuned; None without such machines."""
-    found = {(row.tuner, row.machine): row for rows in done.values() for row in rows}
+    found = {(row.tuner, row.machine): row for row in done.values()}
     common = [machine.name for machine in machines if all((name, machine.name) in found for name in tuners)]
     if not common:
         return None
@@ -203,76 +204,77 @@ def _compared(
 
 
 class _Task(NamedTuple):
-    """A tuner on the machines of a group."""
+    """A tuner on a machine."""
 
-    group: list[SuiteMachine]
-    oracles: list[Oracle]
+    machine: SuiteMachine
+    oracle: Oracle
     seed: int
     dynamics: str
     tuner: str
     trials: int | None
 
 
-Fresh = Iterator[tuple[int, list[MachineRow]]]  # number of a task, and its rows
+Fresh = Iterator[tuple[int, MachineRow]]  # number of a task, and its row
 Say = Callable[[_Task], None]  # called with a task that begins, or that a pool has finished
 
 
 def _here(tasks: Sequence[_Task], left: Sequence[int], tuners: Mapping[str, Tuner], say: Say) -> Fresh:
-    """Run tasks one after the other; the bench of a group is shared by consecutive tasks."""
+    """Run tasks one after the other; the bench of a machine is shared by consecutive tasks."""
     with ExitStack() as open_now:
         bench: _Bench | None = None
         for k in left:
-            if bench is None or bench.task.group is not tasks[k].group:
+            if bench is None or bench.task.machine is not tasks[k].machine:
                 open_now.close()
                 bench = open_now.enter_context(closing(_Bench(tasks[k], None)))
             say(tasks[k])
-            yield k, bench.rows(tasks[k].tuner, tuners[tasks[k].tuner])
+            yield k, bench.row(tasks[k].tuner, tuners[tasks[k].tuner])
 
 
 def _elsewhere(tasks: Sequence[_Task], left: Sequence[int], pool: Pool, say: Say) -> Fresh:
     """Run tasks in a pool, with the content of their files, and yield them in the order in which they finish."""
-    items = [
-        tasks[k]._replace(group=[
-            replace(one, **taken_options({"device": one.device, "load": one.load, "motor": one.motor}))
-            for one in tasks[k].group
-        ])
-        for k in left
-    ]  # fmt: skip
+    items = []
+    for k in left:
+        one = tasks[k].machine
+        named = taken_options({"device": one.device, "load": one.load, "motor": one.motor})
+        items.append(tasks[k]._replace(machine=replace(one, **named)))
     for place, text in pool.unordered(_run, items, fits=_is_of):
         say(tasks[left[place]])
-        yield left[place], _rows_of(text)
+        yield left[place], _row_of(text)
 
 
 def _run(task: _Task) -> str:
-    """Tune the machines of a group with a tuner; return the rows as text."""
+    """Tune a machine with a tuner; return the row as text."""
     with closing(_Bench(task, 1)) as bench:
-        return _text_of(bench.rows(task.tuner, find_tuner(task.tuner, task.trials, task.dynamics)))
+        return _text_of(bench.row(task.tuner, find_tuner(task.tuner, task.trials, task.dynamics)))
 
 
 def _is_of(task: _Task, text: Any) -> bool:
-    """Return whether a text contains the rows of this tuner for this group."""
-    rows = [(row.tuner, row.machine) for row in _rows_of(text)]
-    return rows == [(task.tuner, machine.name) for machine in task.group]
+    """Return whether a text contains the row of this tuner for this machine."""
+    row = _row_of(text)
+    return (row.tuner, row.machine) == (task.tuner, task.machine.name)
 
 
-def _text_of(rows: Sequence[MachineRow]) -> str:
-    return json.dumps([asdict(row) for row in rows])
+def _text_of(row: MachineRow) -> str:
+    return json.dumps(asdict(row))
 
 
-def _rows_of(text: str) -> list[MachineRow]:
-    return [MachineRow(**row) for row in parse_json(text)]
+def _row_of(text: str) -> MachineRow:
+    return MachineRow(**parse_json(text))
 
 
-def _rows_in(log: ShardLog | None) -> dict[int, list[MachineRow]]:
-    return {} if log is None else {k: _rows_of(str(arrays["rows"])) for k, arrays in log.done.items()}
+def _rows_in(log: ShardLog | None) -> dict[int, MachineRow]:
+    return {} if log is None else {k: _row_of(str(arrays["row"])) for k, arrays in log.done.items()}
 
 
 class _Bench:
-    """The machines of a task's group, opened with factory settings for every tuner."""
+    """The machine of a task, opened with factory settings for every tuner.
+
+    Each machine is tuned alone: together with others it would wait for the slowest, which no real one does.
+    """
 
     def __init__(self, task: _Task, num_threads: int | None) -> None:
         self.task, self._num_threads = task, num_threads
-        self._yardstick = Yardstick(task.group, num_threads, dynamics=task.dynamics)
+        self._yardstick = Yardstick([task.machine], num_threads, dynamics=task.dynamics)
         self._identified: tuple[list[Plant | str], float, Integers, DriveAudit] | None = None
 
     def close(self) -> None:
@@ -281,11 +283,12 @@ class _Bench:
 
     def _tune(self, name: str, tuner: Tuner) -> tuple[Outcome | None, Integers, str, DriveAudit]:
         """Return a tuner's outcome, None after an error; the gains left in the drives; the error; and the audit."""
-        with open_group(self.task.group, self._num_threads) as target:
+        with open_group([self.task.machine], self._num_threads) as target:
             audit = DriveAudit(target)
             watched = replace(target, drives=ObservedDrives(target.drives, audit))
-            machines = (zlib.crc32(machine.name.encode()) for machine in self.task.group)
-            rng = np.random.default_rng((self.task.seed, zlib.crc32(name.encode()), *machines))
+            rng = np.random.default_rng(
+                (self.task.seed, *(zlib.crc32(x.encode()) for x in (name, self.task.machine.name)))
+            )
             with warnings.catch_warnings():
                 warnings.filterwarnings("ignore", "machine .* left the range of physics", RuntimeWarning)
                 try:
@@ -305,47 +308,41 @@ class _Bench:
         plants, seconds, before, audit = self._identified
         return tuner.propose(target, plants, before, seconds), audit
 
-    def rows(self, name: str, tuner: Tuner) -> list[MachineRow]:
-        """Tune every machine of the group with a tuner and judge the gains."""
+    def row(self, name: str, tuner: Tuner) -> MachineRow:
+        """Tune the machine with a tuner and judge the gains."""
         outcome, gains, failure, audit = self._tune(name, tuner)
         scores, worst = self._yardstick.score(gains), self._yardstick.margins(gains)
-        asked, per_machine = self._yardstick.dynamics, self._yardstick.axes
-        vouched = None if outcome is None else outcome.accepted
-        accepted = np.full(len(gains), outcome is not None) if vouched is None else vouched
-        rows = []
-        for k, (machine, oracle) in enumerate(zip(self.task.group, self.task.oracles, strict=True)):
-            axes = slice(k * per_machine, (k + 1) * per_machine)
-            counts = audit.violations[:, axes].sum(axis=1)
-            notes = [failure] if outcome is None else [note for note in outcome.notes[axes] if note]
-            phase, gain, ms, slack = (
-                float(value[k]) if np.isfinite(value[k]) else None for value in (*worst, scores.slack)
-            )
-            rows.append(
-                MachineRow(
-                    tuner=name,
-                    machine=machine.name,
-                    robust_cost=float(scores.robust_cost[k]),
-                    performance=float(scores.performance[k]),
-                    oracle=oracle.performance,
-                    relative=float(scores.performance[k]) / oracle.performance,
-                    slack=slack,
-                    phase_deg=phase,
-                    gain_db=gain,
-                    ms=ms,
-                    near=(phase is None or phase >= asked.phase_deg - NEAR_PHASE)
-                    and (gain is None or gain >= asked.gain_db - NEAR_GAIN),
-                    accepted=bool(accepted[axes].all()),
-                    drive_seconds=round(float(audit.seconds[axes].max()), 3),
-                    moves=int(audit.moves[axes].sum()),
-                    aborts=0 if outcome is None else int(outcome.aborts[axes].sum()),
-                    violations=int(counts.sum()),
-                    kinds=", ".join(f"{kind} {count}" for kind, count in zip(KINDS, counts, strict=True) if count),
-                    failed=outcome is None,
-                    gains=dict(zip(self._yardstick.device.gains.names, map(int, gains[axes.start]), strict=True)),
-                    note=" | ".join(notes).replace("\n", " "),
-                )
-            )
-        return rows
+        asked, oracle = self._yardstick.dynamics, self.task.oracle.performance
+        counts = audit.violations.sum(axis=1)
+        accepted = outcome is not None and (outcome.accepted is None or bool(np.all(outcome.accepted)))
+        notes = [failure] if outcome is None else [note for note in outcome.notes if note]
+        phase, gain, ms, slack = (
+            float(value[0]) if np.isfinite(value[0]) else None for value in (*worst, scores.slack)
+        )
+        return MachineRow(
+            tuner=name,
+            machine=self.task.machine.name,
+            robust_cost=float(scores.robust_cost[0]),
+            performance=float(scores.performance[0]),
+            oracle=oracle,
+            relative=float(scores.performance[0]) / oracle,
+            slack=slack,
+            phase_deg=phase,
+            gain_db=gain,
+            ms=ms,
+            near=(phase is None or phase >= asked.phase_deg - NEAR_PHASE)
+            and (gain is None or gain >= asked.gain_db - NEAR_GAIN),
+            accepted=accepted,
+            reserved=accepted and outcome is not None and outcome.reserved is not None and bool(outcome.reserved.any()),
+            drive_seconds=round(float(audit.seconds.max()), 3),
+            moves=int(audit.moves.sum()),
+            aborts=0 if outcome is None else int(outcome.aborts.sum()),
+            violations=int(counts.sum()),
+            kinds=", ".join(f"{kind} {count}" for kind, count in zip(KINDS, counts, strict=True) if count),
+            failed=outcome is None,
+            gains=dict(zip(self._yardstick.device.gains.names, map(int, gains[0]), strict=True)),
+            note=" | ".join(notes).replace("\n", " "),
+        )
 
 
 def _checked_gains(outcome: Any, target: Target) -> Integers:
@@ -378,6 +375,7 @@ def _summary(name: str, rows: Sequence[MachineRow]) -> TunerRow:
         ms=percentile("ms", 50),
         ms_p95=percentile("ms", 95),
         accepted=float(np.mean([row.accepted for row in rows])),
+        reserved=float(np.mean([row.reserved for row in rows])),
         drive_seconds=float(np.median([row.drive_seconds for row in rows])),
         moves=float(np.median([row.moves for row in rows])),
         aborts=sum(row.aborts for row in rows),

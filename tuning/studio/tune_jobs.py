@@ -400,7 +400,7 @@ def _progress(desk: TuneDesk, run: TunerSession) -> Callable[[str, float], None]
 def _keep_measured(desk: TuneDesk, target: Target, result: Any, title: str) -> list[int]:
     """Store auto's recordings, with the present gains' moves last, and responses; return the axes with a response."""
     from tuning.auto.certify import recorded_moves
-    from tuning.auto.result import Result
+    from tuning.auto.stages import Result
 
     if not isinstance(result, Result):
         return []  # the result of a stepper's commissioning has no recordings
