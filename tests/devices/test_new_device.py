@@ -8,6 +8,7 @@ exported as a DCF. By default one of each maker as emulated drives, and over the
 from __future__ import annotations
 
 import errno
+import json
 import math
 import os
 import re
@@ -38,6 +39,7 @@ from drive_env.drives.speeds import per_increment
 from drive_env.fieldbus.description import describe
 from drive_env.master.commissioned_eds import commissioned_eds, commissioned_values
 from drive_env.motors import find_motor
+from tuning.commands.cli import app as tune
 
 FILES = files()
 # rpm; scaled counts, 6060h write-only; two axes; PDOs that can only be read; a DCF
@@ -158,6 +160,14 @@ def test_each_becomes_a_drive_that_lives(folders, name):
                 assert np.all((entry_.low <= value) & (value <= entry_.high)) or entry_.access == "const", entry_.label
     assert find_device(folder).num_axes == (2 if "fjord" in name else 1)
     check_linear_model(find_device(folder))  # identification, rules and agents know its loops
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["jura_1", "helvia_1"])
+def test_it_is_identified_and_tuned_as_a_drive_of_ours(folders, name):
+    found = CliRunner().invoke(tune, ["rules", "--device", str(folders[name].folder), "--load", "inertia", "--json"])
+    assert found.exit_code == 0, found.output
+    assert json.loads(found.stdout)[0]["axis"] == 0
 
 
 @contextmanager

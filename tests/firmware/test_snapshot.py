@@ -168,6 +168,7 @@ def test_drives_of_another_kind_or_number_are_refused(target):
 @pytest.mark.parametrize(("text", "message"), [
     ("device = 3", "is not a file with the state before"),
     ("device = ", "is not TOML"),
+    ('device = "mine"\n[[axis]]\n', "no device is named 'mine'.*: call drive-tune undo in the one where the run"),
     ('device = "tmcm1636"\n[[axis]]\n"6041:00" = 3', "6041:00 = 3: .* can only be read"),
     ('device = "tmcm1636"\n[[axis]]\n"2003:00" = 999999999', "2003:00 = 999999999"),
     ('device = "tmcm1636"\n[[axis]]\nx = 3', "x = 3"),
