@@ -261,8 +261,8 @@ def _report(target: Target, result: Result, folder: Path, json: bool, search: Ma
     lines.append(
         f"{result.drive_seconds.max():.1f} s of drive time, {stopped} trial{'s' * (stopped != 1)} stopped{kept}"
     )
-    files = ("before.toml", "certificate.json", "report.html", *(() if search is None else SEARCH_FILES))
-    lines.append(f"written to {folder}: {', '.join(files)}")
+    left = ("before.toml", "certificate.json", "report.html", *(() if search is None else SEARCH_FILES))
+    lines.append(f"written to {folder}: {', '.join(left)}")
     if target.bus:
         lines.append(f"drive-tune undo {result.file} restores the state before")
     print_lines(lines)
