@@ -189,7 +189,13 @@ def load_snapshot(path: str | Path, *, unchecked: bool = False) -> Snapshot:
     tables = data.get("axis")
     if not isinstance(tables, list) or not tables or not isinstance(data.get("device"), str):
         raise SnapshotError(f"{where} is not a file with the state before a change; give one that drive-tune saved")
-    known = describe(data["device"], None, on_ethercat=True)  # the file's drives may be on either bus
+    try:
+        known = describe(data["device"], None, on_ethercat=True)  # the file's drives may be on either bus
+    except ValueError as error:
+        raise SnapshotError(
+            f"{where}: {error}; a device of your own is looked for from the present folder: call drive-tune undo in "
+            "the one where the run was started"
+        ) from None
     axes = [_checked_axis(where, table, known) for table in tables]
     left_out = data.get("left_out", {})
     if not isinstance(left_out, dict) or not all(name.isdecimal() for name in left_out):

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from agents.benchmark.results import BASELINE, RESULT, SUBMITTED, TRAINED, Row, RowError
 from agents.evaluation.evaluation import evaluate
 from agents.evaluation.evaluation_shards import Written
-from agents.evaluation.open_policy import is_baseline, names_a_file
+from agents.evaluation.open_policy import is_baseline, names_a_file, open_policy
 from agents.evaluation.scores import RETURN
 from agents.policies.baselines import baselines_of
 from agents.seeds import TEST
@@ -111,7 +111,9 @@ def submitted_run(task: str, text: str, trust: bool) -> BenchmarkRun:
     name = Path(text).stem if names_a_file(text) else text.replace(":", ".")
     if is_baseline(text) or name in (*ALGORITHMS, *baselines_of(task)):
         raise ValueError(f"{text} has the name of a baseline or an algorithm of the table; give it one of its own")
-    return BenchmarkRun(task, name, SUBMITTED, written=Written.of(text, trust))
+    written = Written.of(text, trust)
+    judge(open_policy(text, trust=trust).policy, task, 1)  # what cannot act there is refused before all else is run
+    return BenchmarkRun(task, name, SUBMITTED, written=written)
 
 
 def make(

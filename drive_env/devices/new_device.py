@@ -498,7 +498,7 @@ class _Draft:
         }  # fmt: skip
         for sub, row in enumerate(rows, 1):
             unit = self._unit(row.unit)
-            section = {"ParameterName": row.name, "DataType": f"0x{TYPES[row.kind]:04X}", "AccessType": "rw"}
+            section = {"ParameterName": row.name, "DataType": f"0x{TYPES[row.kind]:04X}", "AccessType": row.access}
             shown = {} if unit == "raw" else {"Unit": _shown(unit)}
             default = (told or round(self._motor.encoder_counts)) if row.field == "position_scaler" else 0
             self._sections[object_section(index, sub)] = section | {"DefaultValue": str(default)} | shown

@@ -36,6 +36,7 @@ class OwnObject(NamedTuple):
         role: Its role; "" if it has none.
         modes: Modes of operation that need it; empty: every drive needs it.
         unless: A field that serves the same purpose if an object has it; "" if no field does.
+        access: "rw", or "ro" for a measured value.
     """
 
     name: str
@@ -46,6 +47,7 @@ class OwnObject(NamedTuple):
     role: str = ""
     modes: Sequence[int] = ()
     unless: str = ""
+    access: str = "rw"
 
 
 _DATA = read_toml(Path(__file__).parent / "standard.toml")

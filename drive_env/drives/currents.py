@@ -1,4 +1,4 @@
-"""Units of torques and current limits: milliamperes, or relative to the motor's peak or nominal current."""
+"""Units of torques and current limits: milliamperes, or relative to the motor's rated, peak or nominal current."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from drive_env.dictionary.units import MILLIAMPERE
 from drive_env.drives.interface import BasicDrives, Drives
 from mechanics.arrays import Floats, Integers, Mask
 
-_OF_PEAK, _OF_NOMINAL = "1/32767 M-Ipeak", "1/1000 of M-Inull"
+_OF_PEAK, _OF_NOMINAL, _OF_RATED = "1/32767 M-Ipeak", "1/1000 of M-Inull", "1/1000 rated"
 _WHOLE = 32767.0
 
 
@@ -28,6 +28,8 @@ def ampere_per_count(drives: Drives) -> Floats | float:
     """
     device = drives.device
     row = None if device is None else device.bindings.get((cia402.TORQUE_ACTUAL, 0))
+    if device is not None and row is not None and row.unit == _OF_RATED:
+        return 1e-3 * device.rated_current
     if row is None or row.unit not in (_OF_PEAK, _OF_NOMINAL):
         return MILLIAMPERE
     return peak_current(drives) / _WHOLE if row.unit == _OF_PEAK else ampere_per_limit(drives)
@@ -35,8 +37,7 @@ def ampere_per_count(drives: Drives) -> Floats | float:
 
 def counts_per_ampere(drives: Drives) -> Floats | float:
     """Return the counts per ampere of 6071h and 6077h, one or shape (num_axes,)."""
-    per_count = ampere_per_count(drives)
-    return 1e3 if isinstance(per_count, float) else 1.0 / per_count
+    return 1.0 / ampere_per_count(drives)
 
 
 def peak_current(drives: BasicDrives) -> Floats:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import fields
@@ -37,8 +38,8 @@ _KINDS: dict[str, tuple[str, Callable[[Any], bool]]] = {
         lambda value: isinstance(value, str | list | tuple) and all(isinstance(one, str) for one in value),
     ),
     "Mapping[str, float]": (
-        "a table of numbers",
-        lambda value: isinstance(value, Mapping) and all(_is_number(one) for one in value.values()),
+        "a table of finite numbers",
+        lambda value: isinstance(value, Mapping) and all(_is_number(v) and math.isfinite(v) for v in value.values()),
     ),
 }
 

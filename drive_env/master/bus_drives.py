@@ -41,6 +41,7 @@ from drive_env.master.cycle_runner import CycleRunner
 from drive_env.master.pace import Pace
 from drive_env.master.sampling import run_cycles
 from drive_env.safety.envelope import Envelope, SafetyError
+from drive_env.safety.objects import STORE
 from drive_env.safety.watched_drives import CycleWatch
 from mechanics.arrays import Integers, Mask
 
@@ -145,6 +146,8 @@ class BusDrives:
         raw = checked_values(entry, value, self.num_axes)
         if self.safety is not None:
             self.safety.before_write(entry, raw, axes)
+        if entry.index == STORE:
+            self._restore_process_data()
         try:
             if entry.index == cia402.CONTROLWORD and np.count_nonzero(axes) > 1:
                 words = [self._addressed(entry, axis, int(raw[axis])) for axis in np.flatnonzero(axes).tolist()]
@@ -418,6 +421,13 @@ class BusDrives:
             self._catch_up()
 
     # --- inside ---------------------------------------------------------------------------------------------------
+    def _restore_process_data(self) -> None:
+        """Restore the nodes' own process data, which they are about to store; the next cycle maps what it needs."""
+        nodes = range(len(self.nodes))
+        for k in nodes:
+            self._link.process.restore(k)
+        self.forget(nodes)
+
     def _scales(self) -> list[Scale]:
         """Read the scale of every axis' units, as far as the drive reports it."""
         return scales_of(self, self._description.dictionary)

@@ -44,7 +44,6 @@ from drive_env.safety.bounds import (
 )
 from drive_env.safety.commands import Commands
 from drive_env.safety.errors import SafetyError as SafetyError
-from drive_env.safety.errors import logged
 from drive_env.safety.lending import Lending
 from drive_env.safety.limits_in_force import STOP_WITHIN, LimitsInForce
 from drive_env.safety.objects import CONTROLWORD, MODE, SET_POINTS, STATUSWORD, STORE, VL_BRAKING
@@ -155,13 +154,8 @@ class Envelope:
             self._arm()
         if self._axes.is_armed:
             self._stops.keep_ramps(key, raw, where)
-        if entry.index == STORE and self._axes.is_armed:
-            if self._stops.lends_ramps() and self._watch.look_for_live():
-                raise SafetyError(
-                    f"{entry.label}: what the drives store is their own, by which a stop would let an axis that is "
-                    "enabled coast meanwhile; nothing was sent. Disable it first"
-                )
-            self._lending.give_back(set(range(self._drives.num_axes)))
+        if entry.index == STORE and self._is_ours():
+            self._give_all_back(entry)
         if key in scale_objects(self._drives.description):
             self._limits.keep_place()
 
@@ -173,9 +167,6 @@ class Envelope:
             self._limits.place_again()
         elif self._is_limit(key):
             self._limits.forget()
-        if entry.index == STORE and self._axes.is_armed:
-            with logged():
-                self._lend()
 
     def after_write(self, entry: Entry, raw: Integers, where: Mask) -> None:
         """Update what depends on an object that was written: mode, set-points, scale, limits."""
@@ -193,8 +184,17 @@ class Envelope:
             self._limits.forget()
             if key == HOME_OFFSET and self._axes.is_armed:
                 self._limits.lend()  # also corrects software limits
-        elif entry.index == STORE and self._axes.is_armed:
-            self._lend()
+
+    def _give_all_back(self, entry: Entry) -> None:
+        """Give limits and watchdogs back before the drives store what they have; the next command arms anew."""
+        if self._watch.look_for_live():
+            raise SafetyError(
+                f"{entry.label}: the drives would store the limits and the watchdog that they were lent while an axis "
+                "is enabled; nothing was sent. Disable it first"
+            )
+        self._lending.give_back(set(range(self._drives.num_axes)))
+        self.close()
+        self._check_none_lost()
 
     def _is_limit(self, key: Key) -> bool:
         """Return whether the limits or the stopping distance depend on an object."""

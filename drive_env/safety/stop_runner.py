@@ -134,14 +134,6 @@ class StopRunner:
                     "nothing was sent"
                 )
 
-    def lends_ramps(self) -> bool:
-        """Return whether an axis would coast by its own option and has a ramp lent instead."""
-        return any(
-            self._lending.is_lent(key, axis) and self._lending.owned(key, axis) == COASTS
-            for key in RAMPS
-            for axis in range(self._drives.num_axes)
-        )
-
     def cuts(self, words: Integers) -> Mask:
         """Return the axes whose voltage controlwords cut at once, by the present 605Ch of each axis."""
         cuts: Mask = cia402.cuts_voltage(words)

@@ -8,6 +8,7 @@ exported as a DCF. By default one of each maker as emulated drives, and over the
 from __future__ import annotations
 
 import errno
+import json
 import math
 import os
 import re
@@ -34,10 +35,12 @@ from drive_env.devices.gains import check_linear_model
 from drive_env.devices.new_device import new_device
 from drive_env.dictionary.access import ObjectAccessError
 from drive_env.dictionary.roles import Role
+from drive_env.drives.currents import read_current_limit, to_counts, write_current_limit
 from drive_env.drives.speeds import per_increment
 from drive_env.fieldbus.description import describe
 from drive_env.master.commissioned_eds import commissioned_eds, commissioned_values
 from drive_env.motors import find_motor
+from tuning.commands.cli import app as tune
 
 FILES = files()
 # rpm; scaled counts, 6060h write-only; two axes; PDOs that can only be read; a DCF
@@ -158,6 +161,20 @@ def test_each_becomes_a_drive_that_lives(folders, name):
                 assert np.all((entry_.low <= value) & (value <= entry_.high)) or entry_.access == "const", entry_.label
     assert find_device(folder).num_axes == (2 if "fjord" in name else 1)
     check_linear_model(find_device(folder))  # identification, rules and agents know its loops
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["jura_1", "helvia_1"])
+def test_it_is_identified_and_tuned_as_a_drive_of_ours(folders, name):
+    known = ("--device", str(folders[name].folder), "--load", "inertia")
+    found = CliRunner().invoke(tune, ["rules", *known, "--json"])
+    assert found.exit_code == 0, found.output
+    assert json.loads(found.stdout)[0]["axis"] == 0
+    steps = [part for step in ("motor", "wiring", "current") for part in ("--step", step)]
+    found = CliRunner().invoke(
+        tune, ["commission", *known, *steps, "--yes", "--out", str(folders[name].folder.parent / f"path_{name}")]
+    )
+    assert found.exit_code == 0 and "Current loop done" in found.output, found.output
 
 
 @contextmanager
@@ -331,6 +348,9 @@ def test_thousandths_are_of_the_motors_rated_current(folders):
         assert drives.inside.records["i_q"][0][0] == pytest.approx(1.05, abs=0.05)
         assert drives.read(0x6077)[0] == pytest.approx(300, abs=15)
         assert drives.read(0x6073)[0] == 2000  # twice the rated current, as every preset
+        assert read_current_limit(drives)[0] == pytest.approx(7.0) and to_counts(drives, 1.05)[()] == 300
+        write_current_limit(drives, 1.75)
+        assert drives.read(0x6073)[0] == 500
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import uuid
@@ -168,6 +169,7 @@ def test_drives_of_another_kind_or_number_are_refused(target):
 @pytest.mark.parametrize(("text", "message"), [
     ("device = 3", "is not a file with the state before"),
     ("device = ", "is not TOML"),
+    ('device = "mine"\n[[axis]]\n', "no device is named 'mine'.*: call drive-tune undo in the one where the run"),
     ('device = "tmcm1636"\n[[axis]]\n"6041:00" = 3', "6041:00 = 3: .* can only be read"),
     ('device = "tmcm1636"\n[[axis]]\n"2003:00" = 999999999', "2003:00 = 999999999"),
     ('device = "tmcm1636"\n[[axis]]\nx = 3', "x = 3"),
@@ -240,14 +242,18 @@ def test_one_command_brings_back_what_a_program_left_behind_that_was_killed(tmp_
             transaction = Transaction(target, tmp_path / "before.toml").__enter__()  # and no exit
             write_gains(target.drives, np.repeat(TRIED, 2, axis=0))
             target.drives.write(CURRENT_LIMIT, 1234)
+        machines[0].write(cia402.TARGET_VELOCITY, 5)  # of a program that was killed: no file has it
         assert [gains(machine).tolist() for machine in machines] != before
         assert load_snapshot(transaction.path).bus == {
             "interface": "virtual", "channel": channel, "nodes": [1, 2], "pace": "lockstep",
         }  # fmt: skip
+        told = json.loads(drive_tune("undo", transaction.path, "--dry-run", "--json").stdout)["would change"]
         done = drive_tune("undo", transaction.path, "--yes")
         assert done.exit_code == 0, done.output
+        for row in told:
+            assert f"axis {row['axis']}: {row['object']}: {row['found']} -> {row['wanted']}" in done.stdout
         assert "axis 1: 2003h:00 Maximum Current: 1234 -> 7000" in done.stdout
-        assert re.search(r"^12 parameters restored, \d{3} verified by a second reading$", done.stdout, re.MULTILINE)
+        assert re.search(r"^13 parameters restored, \d{3} verified by a second reading$", done.stdout, re.MULTILINE)
         assert [gains(machine).tolist() for machine in machines] == before
         assert [int(machine.read(CURRENT_LIMIT)[0]) for machine in machines] == [7000, 7000]
         again = drive_tune("undo", transaction.path, "--yes", "--json")

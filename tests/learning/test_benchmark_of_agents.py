@@ -23,6 +23,7 @@ from agents.hyperparameter_search import search
 from agents.policies.agent_file import AgentFile
 from agents.policies.baselines import baseline
 from agents.policies.policy import policy_of
+from agents.shipped import shipped
 from agents.tasks import make_environments
 from agents.training import hyperparameters
 from agents.training.imitation import imitate
@@ -415,6 +416,17 @@ def test_a_mistake_is_told_in_a_line(given, says, tmp_path):
     found = run(*given, *(() if "--resume" in given or "--check" in given else ("--out", tmp_path / "bench")))
     assert found.exit_code == 2 and says in found.output, found.output
     assert "Traceback" not in found.output and len(found.output.strip().splitlines()) == 1
+    assert not (tmp_path / "bench").exists()
+
+
+@pytest.mark.parametrize(("content", "says"), [
+    (b"no agent", "mine.npz is not an agent"),
+    (Path(shipped("arm_path")).read_bytes(), "the policy takes 48 entries"),
+])  # fmt: skip
+def test_a_policy_that_cannot_act_in_the_task_is_refused_before_the_baselines_are_run(content, says, tmp_path):
+    (tmp_path / "mine.npz").write_bytes(content)
+    found = run("--submit", tmp_path / "mine.npz", "--task", TASK, "--out", tmp_path / "bench")
+    assert found.exit_code > 0 and says in found.output and "/tmp/tmp" not in found.output, found.output
     assert not (tmp_path / "bench").exists()
 
 

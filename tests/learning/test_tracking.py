@@ -320,6 +320,11 @@ def test_wrong_tilts_margins_and_ramps_are_refused(options, message):
         TrackingConfig(**options)
 
 
+def test_a_weight_that_makes_no_reward_is_refused():
+    with pytest.raises(ValueError, match="weights must be a table of finite numbers"):
+        Tracking(1, weights={"tracking": np.nan})
+
+
 # --- trajectories -----------------------------------------------------------------------------------------------------
 def test_every_joint_of_an_arm_follows_a_trajectory_of_its_own_that_meets_no_end_stop():
     with tracking(2, load="robot", mode="csp", amplitude=1000.0, speed=2000.0, duration=2.0) as lanes:

@@ -305,23 +305,29 @@ def test_nothing_is_lent_without_limits(bus, drive):
         assert not any(data[0] & 0xE0 == 0x20 and data[1:3] in (b"\x7d\x60", b"\x03\x20") for data in bus.sent(0x601))
 
 
-def test_what_a_drive_stores_is_its_own(bus, drive):
-    stored = {}
-    drive.values[0x1010, 1] = (0, 4)
+@pytest.mark.parametrize("pace", ["lockstep", "real-time"])
+def test_what_a_drive_stores_is_its_own_and_has_neither_our_pdos_nor_our_watchdog(bus, drive, pace):
+    drive.values |= {(0x1010, 1): (0, 4), (0x1029, 1): (1, 1)}
+    lasting = [key for key in drive.values if 0x1016 <= key[0] < 0x1C00 or key in (HIGH, CURRENT)]
+    before, stored = {key: drive.get(*key) for key in lasting}, {}
     truly = drive.set
 
     def store(index, value, sub=0):
         if index == 0x1010:
-            stored.update({key: drive.get(*key) for key in (HIGH, CURRENT)})
+            stored.update({key: drive.get(*key) for key in lasting})
         truly(index, value, sub)
 
     drive.set = store
-    with CanDrives(bus=bus, pace="lockstep", safety=Limits(position=(-TURN, TURN), current=500)) as drives:
+    with CanDrives(bus=bus, pace=pace, safety=Limits(position=(-TURN, TURN), current=500)) as drives:
         motion.enable(drives, mode="csp")
+        drives.record([0x606C, 0x6077], 0.005, play={0x607A: [0] * 5})
         motion.disable(drives)
+        assert {key for key in lasting if drive.get(*key) != before[key]} > {CURRENT, (0x1600, 1), (0x1A00, 1)}
         drives.write((0x1010, 1), 0x65766173)
-        assert stored == {HIGH: 2**31 - 1, CURRENT: 7000}
+        assert stored == before
+        motion.enable(drives, mode="csp")
         assert drive.get(*CURRENT) == 500
+        drives.record([0x606C, 0x6077], 0.005, play={0x607A: [0] * 5})
 
 
 def test_the_drive_itself_holds_the_travel_when_nobody_watches():

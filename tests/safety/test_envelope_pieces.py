@@ -92,10 +92,12 @@ def envelope_of(is_armed=False, live=True):
         description=SimpleNamespace(dictionary=SimpleNamespace(roles={}), has=lambda key: False, role=lambda part: None)
     )
     made._axes, made._set_points = SimpleNamespace(is_armed=is_armed), frozenset(SET_POINTS)
-    made._watch, made._watchdogs = SimpleNamespace(await_stop=nothing), SimpleNamespace(check_not_held=nothing)
+    made._axes.may_turn = np.zeros(1, bool)
+    made._watch = SimpleNamespace(await_stop=nothing, is_supervised=False)
+    made._watchdogs = SimpleNamespace(check_not_held=nothing)
     made._commands = SimpleNamespace(check_write=lambda *arguments: done.append("checked"))
-    made._stops = SimpleNamespace(keep_ramps=lambda *arguments: done.append("ramps kept"), lends_ramps=lambda: False)
-    made._lending = SimpleNamespace(give_back=lambda axes: done.append("given back"))
+    made._stops = SimpleNamespace(keep_ramps=lambda *arguments: done.append("ramps kept"))
+    made._give_all_back = lambda entry: done.append("given back")
     made._drives.num_axes, made._of_further_axes = 1, {}
     made._finds_live = lambda where: live
     made._arm = lambda: done.append("armed")

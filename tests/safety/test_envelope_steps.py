@@ -11,7 +11,6 @@ from rigs.held_objects import CURRENT_LIMIT, HeldObjects
 
 from drive_env import Limits, SafetyError, cia402
 from drive_env.dictionary.roles import Role
-from drive_env.fieldbus.errors import BusError
 from drive_env.safety import envelope as module
 from drive_env.safety.axes import Axes
 from drive_env.safety.envelope import Envelope, swinging_allowed
@@ -168,29 +167,18 @@ def test_a_ramp_by_which_an_axis_is_being_disabled_is_not_written(key):
     bench.before(key)
 
 
-@pytest.mark.parametrize(("lends", "live", "refused"), [(True, True, True), (True, False, False), (False, True, False)])
-def test_what_is_stored_is_the_drives_own_and_no_ramp_that_coasts_while_an_axis_is_live(lends, live, refused):
+def test_what_is_stored_is_the_drives_own_and_nothing_is_while_an_axis_is_live():
     bench = Bench().is_ready()
-    bench.stops.answers["lends_ramps"] = lends
-    bench.watch.answers["look_for_live"] = live
-    if refused:
-        with pytest.raises(SafetyError, match=r"what the drives store is their own.*Disable it first"):
-            bench.before(STORE)
-        assert not bench.asked("give_back")
-    else:
+    with pytest.raises(SafetyError, match=r"limits and the watchdog .* an axis is enabled.*Disable it first"):
         bench.before(STORE)
-        assert bench.asked("give_back") == [({0, 1},)]
-
-
-@pytest.mark.parametrize("is_armed", [True, False])
-def test_after_parameters_were_stored_or_not_limits_are_lent_again(is_armed):
-    bench = Bench()
-    bench.axes.is_armed = is_armed
-    bench.after(STORE)
-    bench.envelope.after_failed_write(bench.entry(STORE))
-    assert bench.names().count("lend") == bench.names().count("make_sure_of_ramps") == (2 if is_armed else 0)
-    bench.limits.answers["lend"] = BusError("no answer")
-    bench.envelope.after_failed_write(bench.entry(STORE))  # told in the log
+    assert not bench.asked("give_back")
+    bench.watch.answers["look_for_live"] = False
+    bench.before(STORE)
+    assert bench.asked("give_back") == [({0, 1},)] and bench.names()[-2:] == ["give_up", "end"]
+    bench.axes.is_armed, bench.axes.live = False, np.array(NONE)  # as the end of watching leaves them
+    bench.done.clear()
+    bench.before(STORE)
+    assert not bench.asked("give_back")
 
 
 def test_who_writes_a_scale_has_the_rotors_keep_their_place():

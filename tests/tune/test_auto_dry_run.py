@@ -183,6 +183,21 @@ def test_an_emulated_drive_is_rehearsed_as_well(tmp_path, monkeypatch):
     assert not any(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("by", [[], ["--by", "tpe"]])
+def test_what_a_stepper_would_write_cannot_be_told_and_no_other_run_is_named_in_its_place(by):
+    found = CliRunner().invoke(app, ["auto", *by, "--device", "tmcm6212", "--load", "inertia", "--dry-run"])
+    assert found.exit_code == 2 and "cannot be listed before; leave --dry-run out" in " ".join(found.stderr.split())
+
+
+@pytest.mark.slow
+def test_the_files_that_a_search_would_write_are_those_that_it_writes(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    search = ["auto", "--by", "tpe", "--load", "inertia", "--trials", "2", "--out", "found", "--json"]
+    told = json.loads(CliRunner().invoke(app, [*search, "--dry-run"]).stdout)["files"]
+    CliRunner().invoke(app, search)
+    assert sorted(told) == sorted(f"found/{one.name}" for one in (tmp_path / "found").iterdir())
+
+
 @pytest.mark.parametrize(("pace", "of_demand"), [("lockstep", "6062h, 6077h"), ("real-time", "is computed from")])
 def test_a_drive_of_two_axes_on_ethercat_is_rehearsed(pace, of_demand):
     with EmulatedSegment("tgz_d", load="inertia", num_machines=2) as segment:

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from drive_env.commands.tables import Column, print_lines, print_table
-from tuning.commands.dry_run import tell_plan
-from tuning.commands.methods import DESIGN, SEARCHES, By, MethodOptions, OpenedMethod, open_method
+from tuning.commands.dry_run import check_can_be_told, tell_plan
+from tuning.commands.methods import DESIGN, SEARCH_FILES, SEARCHES, By, MethodOptions, OpenedMethod, open_method
 from tuning.commands.options import (
     REFUSED,
     DynamicsOption,
@@ -82,7 +82,7 @@ def auto(
         folder = provenance.run_folder("auto") if out is None else out
         provenance.check_folder(folder)
         if dry_run:
-            drive.check_linear_model()  # the writes of a stepper's commissioning cannot be listed
+            check_can_be_told(drive.device)
             with drive.open_to_read() as target:
                 how.method(target)  # an agent prints what it was not trained for
                 tell_plan(target, how, folder, keep=store, json=json)
@@ -134,9 +134,9 @@ def _search(
     search = open_search(by, drive, method, dynamics=dynamics, inertia_range=inertia_range, out=out)
     folder = search.folder
     if dry_run:
-        drive.check_linear_model()
+        check_can_be_told(drive.device)
         with drive.open_to_read() as target:
-            how = OpenedMethod(search.plan, math.inf, lambda target: search.method(folder))
+            how = OpenedMethod(search.plan, math.inf, lambda target: search.method(folder), SEARCH_FILES)
             tell_plan(target, how, folder, keep=store, json=json)
         return
     if not search.is_certified:
@@ -261,8 +261,8 @@ def _report(target: Target, result: Result, folder: Path, json: bool, search: Ma
     lines.append(
         f"{result.drive_seconds.max():.1f} s of drive time, {stopped} trial{'s' * (stopped != 1)} stopped{kept}"
     )
-    trials = "" if search is None else ", trials.csv, trials.png, settings.toml"
-    lines.append(f"written to {folder}: before.toml, certificate.json, report.html{trials}")
+    left = ("before.toml", "certificate.json", "report.html", *(() if search is None else SEARCH_FILES))
+    lines.append(f"written to {folder}: {', '.join(left)}")
     if target.bus:
         lines.append(f"drive-tune undo {result.file} restores the state before")
     print_lines(lines)

@@ -16,6 +16,19 @@ if TYPE_CHECKING:
     from tuning.target import Target
 
 
+def check_can_be_told(name: str) -> None:
+    """Raise ValueError for a device whose writes cannot be listed beforehand."""
+    from drive_env.devices import find_device
+    from drive_env.devices.gains import check_linear_model
+
+    if (device := find_device(name)).gains.is_open_loop:
+        raise ValueError(
+            f"--dry-run: what a run writes to a {device.name} follows from what it measures, and cannot be listed "
+            "before; leave --dry-run out: drive-tune undo restores a drive on a bus from before.toml of the run"
+        )
+    check_linear_model(device)
+
+
 def tell_plan(target: Target, method: OpenedMethod, folder: Path, *, keep: bool, json: bool) -> None:
     """Print the checks and the plan of a run; exit with REFUSED if it would not start.
 
@@ -29,7 +42,7 @@ def tell_plan(target: Target, method: OpenedMethod, folder: Path, *, keep: bool,
     from tuning.rehearsal import Rehearsal, rehearse
 
     found = rehearse(target, keep=keep) if target.bus else Rehearsal((), ())
-    files = [str(folder / name) for name in ("before.toml", "certificate.json", "report.html")]
+    files = [str(folder / name) for name in ("before.toml", "certificate.json", "report.html", *method.files)]
     if json:
         print_json(
             {

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from tuning.target import Target
 
 DESIGN, AGENT, RULE = "design", "agent", "rule"
+SEARCH_FILES = ("trials.csv", "trials.png", "settings.toml")  # that a search writes besides
 SEARCHES = ("tpe", "cmaes", "gp", "random", "grid")  # the samplers of tuning.search
 METHODS = (DESIGN, AGENT, *SEARCHES, RULE)
 RULE_BY_DEFAULT = "margin_55"  # it includes the resonance in its margins, and keeps standard dynamics by the model
@@ -143,11 +144,13 @@ class OpenedMethod(NamedTuple):
     plan: What it does with the drives, for a dry run.
     budget: Greatest drive time for each axis [s]; infinite if the number of trials limits it.
     method: Returns, for opened drives, how a run finds gains.
+    files: What it writes besides those of every run.
     """
 
     plan: str
     budget: float
     method: Callable[[Target], Method]
+    files: tuple[str, ...] = ()
 
 
 def open_method(

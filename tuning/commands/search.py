@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from drive_env.commands.tables import Column, print_lines, print_table
+from tuning.commands.methods import SEARCH_FILES
 from tuning.commands.options import (
     INTERRUPTED,
     check_machines,
@@ -211,7 +212,7 @@ class SearchRun:
             print_json(self.as_dict(before))
             return
         self.print(before)
-        written = [f"written to {self.folder}: trials.csv, trials.png, settings.toml"]
+        written = [f"written to {self.folder}: {', '.join(SEARCH_FILES)}"]
         if before is not None:
             written.append(f"drive-tune undo {before} restores the drives' state before")
         print_lines(written)

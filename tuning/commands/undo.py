@@ -115,7 +115,7 @@ def _print_plan(planned: list[tuple[int, Difference]], *, store: bool, json: boo
 
 def _restore(
     file: Path, snapshot: Snapshot, address: dict[str, Any], store: bool, *, other_drive: bool
-) -> tuple[list[tuple[int, Any]], int]:
+) -> tuple[list[tuple[int, Difference]], int]:
     """Restore a snapshot; return the changes as (axis, difference), and the number of parameters read again."""
     from drive_env.master.open_drives import open_drives
     from drive_env.master.parameters import list_differences, restorable
@@ -127,8 +127,8 @@ def _restore(
     with open_drives(snapshot.device, safety=False, **address) as drives:
         snapshots.check_same_drives(file, snapshot, drives, other_drive=other_drive)
         chosen = drives if axes is None else of_nodes(drives, axes)
-        numbers = [*chosen.axis_numbers, *snapshot.left_out]
-        changed = snapshots.restore(chosen, snapshot)
+        changed = snapshots.differences(drives, snapshot)  # with set-points, which a restoration clears
+        snapshots.restore(chosen, snapshot)
         if store:
             snapshots.store(chosen)
     with open_drives(snapshot.device, safety=False, **address) as drives:
@@ -143,4 +143,4 @@ def _restore(
             f"End it, then restore {file} again",
             REFUSED,
         )
-    return [(axis, change) for axis, changes in zip(numbers, changed, strict=True) for change in changes], verified
+    return changed, verified
