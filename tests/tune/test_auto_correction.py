@@ -169,7 +169,7 @@ def test_what_a_move_shows_is_corrected_too(monkeypatch):
 def test_soft_dynamics_are_asked_where_a_response_was_looked_for_and_not_seen(failed, asked, monkeypatch):
     """What failed its move has no response yet: that says nothing of its loops."""
     first = {"failed": lambda p: failed if p == 1000 else ""}
-    _, bench, _ = corrected(monkeypatch, [800] * 6, measured=False, slack=lambda p: np.nan, **first)
+    _, bench, _ = corrected(monkeypatch, [800] * 6, measured=False, slack=lambda p: 0.5, **first)
     assert bench.asked[0] == asked
 
 

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 SLOWER = 0.6  # factor by which gains that fail their trial are lowered
 CORRECTIONS = 2
-UNSEEN = "not all margins were measured, so soft dynamics are asked of the model"
+UNSEEN = "no loop was measured, so soft dynamics are asked of the model"
 NO_BETTER = "no better as measured: the old ones stay"
 WORTH = 0.85  # of the robust cost on the twins: a smaller improvement is not worth a correction
 SAME = 0.05  # relative difference of cost that two trials of the same gains may have
@@ -224,7 +224,8 @@ def _corrected(
                 gains[k] = _lowered(bench, basis, recorded, k, float(most[k]))
         return gains, why
     # Loops were not measured on machines that failed their move; axes whose measurement failed get more margin.
-    blind = bench.going & bench.whole_machines(recorded.failed == "") & np.isnan(recorded.slack)
+    looked_at = bench.going & bench.whole_machines(recorded.failed == "")
+    blind = looked_at & np.array([measured_axis(bench, basis, recorded, k) is None for k in range(len(gains))])
     if not worth and not blind.any() and not any(_short(bench, recorded, int(k)) for k in np.flatnonzero(bench.going)):
         return gains, why
     designed, cost, present = design_axes(bench, basis, bench.going & ~blind, recorded=recorded, most=most)

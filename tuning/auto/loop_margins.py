@@ -103,15 +103,11 @@ def measure(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mask
 
 
 def _with_slack(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mask) -> RecordedGains:
-    """Add the slack of the axes' loops to the dynamics; nan if not all margins were measured, and none is short."""
+    """Add the slack of the axes' loops to the dynamics; nan if they were not measured."""
     slack = recorded.slack.copy()
     for k in map(int, np.flatnonzero(where)):
         one = measured_axis(bench, basis, recorded, k)
         slack[k] = np.nan if one is None else one.slack(bench.dynamics, recorded.gains[k][None])[0]
-        if isinstance(one, MeasuredAxis) and slack[k] >= 0.0 and recorded.response is not None:
-            own = recorded.gains[k]
-            least = {loop: recorded.response.at_least(loop, own, k) for loop in LOOPS}
-            slack[k] = np.nan if _unseen_loops(least, one.margins(own)) else slack[k]
     return replace(recorded, slack=slack)
 
 
@@ -238,11 +234,15 @@ def _told_bounds(
     bench: AutoBench, basis: Basis, k: int, gains: Integers, response: MeasuredLoop, found: Mapping[str, Margins]
 ) -> dict[str, AtLeast]:
     """Return lower bounds of an axis' margins, and report those that replace a margin that was not measured."""
-    journal, least = bench.journals[k], {loop: response.at_least(loop, gains, k) for loop in LOOPS}
-    blank = _unseen_loops(least, found)
-    for loop in LOOPS:
-        if loop not in blank:
-            tell_bounds(journal, bench.dynamics, loop, found[loop], least[loop])
+    journal, least, blank = bench.journals[k], {loop: response.at_least(loop, gains, k) for loop in LOOPS}, []
+    for loop, one in least.items():
+        # Loops with a margin that was not measured, and that the response gives no bound for.
+        if any(
+            math.isnan(getattr(one, name)) and not math.isfinite(getattr(found[loop], name)) for name in one._fields
+        ):
+            blank.append(loop)
+        else:
+            tell_bounds(journal, bench.dynamics, loop, found[loop], one)
     if blank:
         more, bounds = _by_model(bench, basis, k, gains, blank)
         least |= more
@@ -251,14 +251,6 @@ def _told_bounds(
             f"and the response fits no model; {bounds}"
         )
     return least
-
-
-def _unseen_loops(least: Mapping[str, AtLeast], found: Mapping[str, Margins]) -> list[str]:
-    """Return the loops with a margin that was not measured, and that the response gives no bound for."""
-    return [
-        loop for loop, one in least.items()
-        if any(math.isnan(getattr(one, name)) and not math.isfinite(getattr(found[loop], name)) for name in one._fields)
-    ]  # fmt: skip
 
 
 def tell_overshoot(bench: AutoBench, journal: Journal, overshoot: float) -> None:
