@@ -92,6 +92,7 @@ class PlantFit(NamedTuple):
     reason: str = ""
     second: Pair | None = None
     lost: float = 0.0  # resistance that dead time adds to the winding of an excited axis [ohm]
+    distortion: float = 0.0  # relative difference of passes of both directions, beyond noise
 
     @property
     def is_good(self) -> bool:
@@ -169,7 +170,7 @@ def fit_plant(
     if less is not None and best.model.plant.is_elastic:
         change, doubt = _by_level(loop, best, less)
         scatter = np.hypot(scatter, change)
-    fit = _with_intervals(best, f, scatter, lost)
+    fit = _with_intervals(best, f, scatter, lost)._replace(distortion=distortion)
     # If the resonance was confirmed, passes may differ for other reasons.
     if (doubt or less is None) and distortion > DISTORTED:
         why = (
