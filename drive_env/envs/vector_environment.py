@@ -203,6 +203,8 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
             ValueError: For a state of another configuration, naming what differs; on a bus.
         """
         drives = self._emulated_drives()
+        if not isinstance(state, Mapping) or "of" not in state:
+            raise ValueError(f"{state!r} is no state of environments; give what save_state() has returned")
         check_alike("environments", state["of"], self._description())
         drives.restore_state(state["drives"])
         super().restore_state(state)
@@ -273,7 +275,9 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
                 raise ValueError(f"a state is all that a reset begins from; leave {', '.join(options) or 'seed'} out")
             self.restore_state(state)
             return self._present()
-        if options.get("machine") and self.drives.machine is None:
+        if not isinstance(machine := options.get("machine") or {}, Mapping):
+            raise ValueError(f"machine is {machine!r}; give a dict of parameters by name, such as load.inertia")
+        if machine and self.drives.machine is None:
             raise ValueError("machine is of emulated machines; leave it out on a bus")
         mask = self._reset_mask(options.pop("reset_mask", None))
         for lane, (one, place) in enumerate(self._seeds(seed)):

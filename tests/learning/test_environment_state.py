@@ -203,6 +203,15 @@ def test_a_state_is_of_so_many_environments_and_of_any_number_of_threads():
             threaded.restore_state(environments.save_state())
 
 
+@pytest.mark.parametrize("options", [{"state": {}}, {"state": 5}, {"machine": 5}, {"machine": "heavy"}])
+def test_an_option_of_reset_of_another_kind_is_refused_and_the_episode_goes_on(options):
+    with made(Tracking, {}) as environments:
+        environments.reset(seed=1)
+        with pytest.raises(ValueError, match="give "):
+            environments.reset(options=options)
+        environments.step(environments.action_space.sample())
+
+
 def test_a_state_of_other_drives_is_refused():
     from drive_env import EmulatedDrives
 
