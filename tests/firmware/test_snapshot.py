@@ -304,20 +304,6 @@ def test_a_change_that_the_drives_keep_is_undone_for_good(tmp_path, monkeypatch)
         assert [gains(machine).tolist() for machine in machines] == before
 
 
-def test_an_enabled_axis_is_left_alone(tmp_path, monkeypatch):
-    monkeypatch.setenv("DRIVE_ENV_TIMEOUT", "20")
-    with served() as (channel, machines):
-        with opened(channel) as target:
-            path = take(target).save(tmp_path / "before.toml")
-        machines[0].write(CURRENT_LIMIT, 1234)
-        for word in (0x06, 0x07, 0x0F):
-            machines[0].write(0x6040, word)
-        done = drive_tune("undo", path, "--yes")
-        assert done.exit_code == 1
-        assert "disable it first" in done.stderr
-        assert machines[0].read(CURRENT_LIMIT) == [1234]
-
-
 def test_a_run_that_is_killed_between_its_store_and_its_end_is_undone_for_good(tmp_path, monkeypatch):
     monkeypatch.setenv("DRIVE_ENV_TIMEOUT", "20")
     with served() as (channel, machines):
