@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rigs import ROOT, TESTS
+from rigs.commands import drive_tune
 from rigs.shards import FILES, GRID, PATIENCE, contents, run_command, start_and_wait_for_a_shard
 from rigs.trainings import tiny
-from typer.testing import CliRunner
 
 from agents.evaluation.evaluation import evaluate
 from agents.evaluation.evaluation_shards import Written, evaluate_elsewhere
@@ -31,7 +31,6 @@ from drive_env import motors
 from drive_env.devices import find_device
 from drive_env.motors import find_motor
 from mechanics.loads import MODELS, find_load
-from tuning.commands.cli import app
 from tuning.compare.comparison import compare
 from tuning.compare.suite import load_suite, suite_input
 from tuning.runs import inputs, sweep
@@ -48,7 +47,6 @@ MOTOR = (motors.FOLDER / "qbl4208.toml").read_text(encoding="utf-8")
 RESISTANCE = re.compile(r"(resistance_\w+ = \[)([0-9.]+)")
 INVENTED = TESTS / "invented_drive"
 SMALL = GRID.replace("count = 48", "count = 3")
-OWN = {"device": "invented", "motor": "mine.toml", "load": "arm/arm.xml"}
 
 
 def resistance(text, factor):
@@ -202,12 +200,6 @@ def own_grid(text=SMALL, **names):
     for what, name in (names or {"motor": "mine.toml"}).items():
         text = re.sub(rf"^{what} = .*$", f'{what} = "{name}"', text, flags=re.MULTILINE)
     return text
-
-
-def drive_tune(*arguments):
-    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
-    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
-    return result
 
 
 def begin(out, config):
