@@ -304,20 +304,6 @@ def test_a_change_that_the_drives_keep_is_undone_for_good(tmp_path, monkeypatch)
         assert [gains(machine).tolist() for machine in machines] == before
 
 
-def test_a_run_that_is_killed_between_its_store_and_its_end_is_undone_for_good(tmp_path, monkeypatch):
-    monkeypatch.setenv("DRIVE_ENV_TIMEOUT", "20")
-    with served() as (channel, machines):
-        before = [gains(machine).tolist() for machine in machines]
-        with opened(channel) as target:
-            transaction = Transaction(target, tmp_path / "before.toml").__enter__()  # and no exit
-            write_gains(target.drives, np.repeat(TRIED, 2, axis=0))
-            assert transaction.store()
-        assert drive_tune("undo", transaction.path, "--yes").exit_code == 0
-        with opened(channel) as target:
-            target.drives.reset_node()
-        assert [gains(machine).tolist() for machine in machines] == before
-
-
 def test_what_drives_were_told_to_keep_is_taken_back_for_good(tmp_path, monkeypatch):
     monkeypatch.setenv("DRIVE_ENV_TIMEOUT", "20")
     with served() as (channel, machines), opened(channel) as target:

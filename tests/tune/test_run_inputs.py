@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from rigs import ROOT, TESTS
 from rigs.commands import drive_tune
-from rigs.shards import FILES, GRID, PATIENCE, contents, run_command, start_and_wait_for_a_shard
+from rigs.shards import FILES, GRID, PATIENCE, contents
 from rigs.trainings import tiny
 
 from agents.evaluation.evaluation import evaluate
@@ -295,31 +295,6 @@ def write(path, text):
     return path
 
 
-def test_two_motors_of_one_name_make_two_settings(own):
-    config = write(own / "grid.toml", own_grid())
-    before = load_experiment(config).with_inputs().to_toml({})
-    edit(own / "mine.toml")
-    assert load_experiment(config).with_inputs().to_toml({}) != before
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
-def test_a_killed_sweep_with_a_motor_of_ones_own_is_refused_then_goes_on_to_the_same_bytes(own):
-    config = write(own / "grid.toml", own_grid(GRID.replace("count = 48", "count = 66")))
-    whole = run_command(config, own / "whole")
-    assert whole.returncode == 0, whole.stderr
-    process = start_and_wait_for_a_shard(config, own / "cut")
-    process.kill()
-    process.communicate()
-    edit(own / "mine.toml")
-    refused = run_command(config, own / "cut", "--resume")
-    assert (refused.returncode, "mine.toml (motor) was changed" in refused.stderr) == (2, True), refused.stderr
-    (own / "mine.toml").write_text(MOTOR, encoding="utf-8")
-    done = run_command(config, own / "cut", "--resume")
-    assert done.returncode == 0, done.stderr
-    assert contents(own / "cut") == contents(own / "whole")
-
-
 # --- searches and comparisons -----------------------------------------------------------------------------------------
 def interrupt_the_search(monkeypatch):
     """Have a search of `drive-tune auto --by tpe` end as Ctrl-C ends it, with a part that is done."""
@@ -493,15 +468,6 @@ def test_a_function_of_a_workers_own_is_not_taken_for_the_one_here(own, decoys, 
     other = written._replace(source="0123456789abcdef" * 4)
     with pytest.raises(ValueError, match=r"my_policy:act: a worker's file with it has hash .*, here it has 0123456789"):
         other.open("tracking", options)
-
-
-def test_worker_processes_open_what_was_sent(own, decoys, monkeypatch):
-    sent = taken("motor", "mine.toml")
-    edit(own / "mine.toml")
-    monkeypatch.chdir(decoys)
-    with open_pool(1) as pool:
-        ((_, motor),) = pool.unordered(find_motor, [sent])
-    assert motor.R_s == find_motor("qbl4208").R_s
 
 
 @pytest.mark.slow
