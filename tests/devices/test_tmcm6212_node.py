@@ -9,10 +9,11 @@ from drive_env import EmulatedDrives
 from drive_env.bus.world import World
 from drive_env.canopen.frames import Frame
 from drive_env.cia402 import State, state_of
+from drive_env.dictionary.aborts import WRONG_STATE
 
 AXES = 6
 EACH = range(AXES)
-PROFILE, PDO = 0x800, 0x40  # from an axis to the next
+PROFILE, MOTOR, PDO = 0x800, 0x200, 0x40  # from an axis to the next
 DISABLED, ENABLED, FAULT = State.SWITCH_ON_DISABLED, State.OPERATION_ENABLED, State.FAULT
 
 
@@ -40,6 +41,16 @@ def enable(wire, axes=EACH, mode=3):
 
 def states(wire):
     return [state_of(wire.value(0x6041 + PROFILE * axis)) for axis in EACH]
+
+
+# --- SDO --------------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("axis", EACH)
+def test_limit_switches_and_units_are_chosen_before_an_axis_is_enabled(wire, axis):
+    assert wire.download(0x2005 + MOTOR * axis, 0, 3, 4) == 0
+    enable(wire, [axis])
+    assert wire.download(0x2005 + MOTOR * axis, 0, 0, 4) == WRONG_STATE
+    other = (axis + 1) % AXES
+    assert wire.download(0x2005 + MOTOR * other, 0, 3, 4) == 0, "that is its own affair"
 
 
 # --- EMCY -------------------------------------------------------------------------------------------------------------
