@@ -164,6 +164,25 @@ def test_a_section_may_make_another_void(node):
     assert node.store.sections["lss"] == {}
 
 
+def test_a_node_that_starts_has_what_is_stored_or_the_factory_s(node):
+    assert node.read(0x1800, 1) & 0x7FF == 0x185 and node.read(0x1017) == 0
+    node.write(0x1017, 0, 500)
+    assert node.read(0x1017) == 500 and node.changed == [0x1017]
+    node.objects.restore(7, {(0x1016, 1): 0x50064})
+    assert (node.read(0x1017), node.read(0x1016, 1), node.read(0x1800, 1) & 0x7FF) == (0, 0x50064, 0x187)
+    assert node.objects.factory_value(node.objects.find(0x1800, 1)) & 0x7FF == 0x181
+
+
+def test_what_cannot_be_written_is_a_hardware_error(node):
+    def fails(changed):
+        raise OSError("disk full")
+
+    node.store.save = fails
+    with pytest.raises(ObjectAccessError, match=r"^the parameters cannot be stored: disk full ") as error:
+        node.write(0x1010, 1, SAVE)
+    assert error.value.abort_code == 0x06060000 and node.axes.stored is None
+
+
 # --- the file ---------------------------------------------------------------------------------------------------------
 def test_a_file_has_sections_and_objects_in_order(tmp_path):
     path = tmp_path / "store.json"
