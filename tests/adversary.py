@@ -55,7 +55,6 @@ AFTERWARDS = 1500  # cycles after the program's end for the drive's own reaction
 
 LOADS = ("inertia", "two_mass", "three_mass", "belt", "ball_screw", "geared_joint", "winder", "belt", "two_mass", "fan")
 MACHINES = 20
-PRESET_SPEED = 20 * TURN  # at which the stopping distance is measured [pps]
 
 # Sensors, commutation and loops; what shortens the current that brakes. Whoever writes them may find no brake left.
 COMMISSIONING = range(0x2000, 0x3000)

@@ -14,7 +14,6 @@ from rigs import TESTS
 from drive_env import EmulatedDrives
 from drive_env.canopen.frames import Frame
 from drive_env.canopen.node import Node
-from drive_env.node.block_transfer import crc
 
 DEVICE = str(TESTS / "all_services.toml")
 TEXT, DATA = 0x2F00, 0x2F01
@@ -32,10 +31,6 @@ def written(wire, text, index=DATA):
     wire.node.dictionary.port(index, 0).write_text(text)
 
 
-def test_the_checksum_is_the_one_of_the_standard():
-    assert crc(b"123456789") == 0x31C3
-
-
 # --- download ---------------------------------------------------------------------------------------------------------
 def test_a_download_of_one_block(wire):
     wire.play("""
@@ -48,40 +43,6 @@ def test_a_download_of_one_block(wire):
         tx 585  A1 00 00 00 00 00 00 00
     """)
     assert wire.value(DATA) == "123456789"
-
-
-def test_a_lost_segment_is_sent_again_with_all_behind_it(wire):
-    wire.play("""
-        rx 605  C6 01 2F 00 1C 00 00 00   # 28 bytes: four segments
-        tx 585  A4 01 2F 00 7F 00 00 00
-        rx 605  01 41 41 41 41 41 41 41
-        rx 605  03 43 43 43 43 43 43 43   # the second is lost
-        rx 605  84 44 44 44 44 44 44 44
-        tx 585  A2 01 7F 00 00 00 00 00   # only the first came in order
-        rx 605  01 42 42 42 42 42 42 42   # the next sub-block begins behind it
-        rx 605  02 43 43 43 43 43 43 43
-        rx 605  02 43 43 43 43 43 43 43   # twice: it counts once
-        rx 605  83 44 44 44 44 44 44 44
-        tx 585  A2 03 7F 00 00 00 00 00
-    """)
-    check = crc(b"A" * 7 + b"B" * 7 + b"C" * 7 + b"D" * 7).to_bytes(2, "little").hex(" ")
-    wire.play(f"rx 605  C1 {check} 00 00 00 00 00\ntx 585  A1 00 00 00 00 00 00 00")
-    assert wire.value(DATA) == "AAAAAAABBBBBBBCCCCCCCDDDDDDD"
-
-
-def test_a_first_segment_that_is_lost_and_the_last_that_counts_no_sooner(wire):
-    wire.play("""
-        rx 605  C2 01 2F 00 08 00 00 00   # no CRC
-        tx 585  A4 01 2F 00 7F 00 00 00
-        rx 605  82 42 00 00 00 00 00 00
-        tx 585  A2 00 7F 00 00 00 00 00   # none in order
-        rx 605  01 41 41 41 41 41 41 41
-        rx 605  82 42 00 00 00 00 00 00
-        tx 585  A2 02 7F 00 00 00 00 00
-        rx 605  D9 00 00 00 00 00 00 00
-        tx 585  A1 00 00 00 00 00 00 00
-    """)
-    assert wire.value(DATA) == "AAAAAAAB"
 
 
 def test_a_number_may_come_in_a_block(wire):
@@ -116,60 +77,6 @@ def test_an_initiate_request_is_refused(wire, initiate, code):
     wire.play("rx 605  40 41 60 00 00 00 00 00\ntx 585  4B 41 60 00 50 02 00 00")
 
 
-@pytest.mark.parametrize(
-    ("steps", "code"),
-    [
-        ("00 41 41 41 41 41 41 41", "03 00 04 05"),  # segments begin with 1
-        ("81 41 41 41 41 41 41 41|C2 00 00 00 00 00 00 00", "01 00 04 05"),  # no end, nor a beginning
-        ("81 41 41 41 41 41 41 41|C5 12 34 00 00 00 00 00", "04 00 04 05"),  # CRC
-        ("81 41 41 41 41 41 41 41|C1 .. .. 00 00 00 00 00", "13 00 07 06"),  # nine bytes were announced
-    ],
-)
-def test_a_wrong_step_ends_a_download_and_changes_nothing(wire, steps, code):
-    good = crc(b"A" * 7).to_bytes(2, "little").hex(" ")
-    *before, last = steps.replace(".. ..", good).split("|")
-    wire.play("rx 605  C6 01 2F 00 09 00 00 00\ntx 585  A4 01 2F 00 7F 00 00 00")
-    for step in before:
-        assert wire.receive(0x605, step)[0].data[0] == 0xA2
-    if last.startswith("C2"):  # which initiates another download
-        wire.play("rx 605  E1 00 00 00 00 00 00 00\ntx 585  80 00 00 00 01 00 04 05")
-    else:
-        wire.play(f"rx 605  {last}\ntx 585  80 01 2F 00 {code}")
-    assert wire.value(DATA) == ""
-
-
-def test_segments_behind_an_abort_are_no_requests(wire):
-    """Of a sub-block that is refused some are on their way: 2Fh might be a write, and what follows it an object."""
-    wire.play("rx 605  C2 01 2F 00 FF 0F 00 00\ntx 585  A4 01 2F 00 7F 00 00 00")
-    for number in range(1, 0x2F):
-        assert wire.receive(0x605, f"{number:02X} 60 60 00 03 00 00 00") == []
-    wire.node._sdo.block._room = 0x2E * 7  # the memory is full
-    wire.play("""
-        rx 605  2F 60 60 00 03 00 00 00
-        tx 585  80 01 2F 00 05 00 04 05
-        rx 605  30 60 60 00 03 00 00 00   # no answer to what was sent before the abort was read
-        rx 605  31 60 60 00 03 00 00 00
-        rx 605  40 60 60 00 00 00 00 00   # a new request
-        tx 585  4F 60 60 00 00 00 00 00
-        rx 605  2F 60 60 00 03 00 00 00   # and a write is one again
-        tx 585  60 60 60 00 00 00 00 00
-    """)
-
-
-def test_the_client_aborts_within_a_sub_block(wire):
-    wire.play("""
-        rx 605  C2 01 2F 00 15 00 00 00
-        tx 585  A4 01 2F 00 7F 00 00 00
-        rx 605  01 41 41 41 41 41 41 41
-        rx 605  80 01 2F 00 00 00 00 08
-        rx 605  C1 00 00 00 00 00 00 00   # it is over
-        tx 585  80 00 00 00 01 00 04 05
-        rx 605  40 41 60 00 00 00 00 00
-        tx 585  4B 41 60 00 50 02 00 00
-    """)
-    assert wire.value(DATA) == ""
-
-
 @pytest.mark.parametrize("begin", ["C2 01 2F 00 15 00 00 00", "A0 00 2F 00 7F 00 00 00"])
 def test_a_silent_client_ends_a_block_transfer(wire, begin):
     assert wire.receive(0x605, begin)[0].data[0] in (0xA4, 0xC6)
@@ -179,105 +86,7 @@ def test_a_silent_client_ends_a_block_transfer(wire, begin):
     wire.play("rx 605  40 41 60 00 00 00 00 00\ntx 585  4B 41 60 00 50 02 00 00")
 
 
-def test_each_segment_lets_the_client_live(wire):
-    wire.play("rx 605  C2 01 2F 00 15 00 00 00\ntx 585  A4 01 2F 00 7F 00 00 00")
-    for step in ("01 41 41 41 41 41 41 41", "02 42 42 42 42 42 42 42"):
-        wire.wait(900)
-        assert wire.receive(0x605, step) == []
-    wire.wait(900)
-    wire.play("rx 605  83 43 43 43 43 43 43 43\ntx 585  A2 03 7F 00 00 00 00 00")
-
-
 # --- upload -----------------------------------------------------------------------------------------------------------
-def test_an_upload_of_two_sub_blocks(wire):
-    written(wire, "123456789")
-    wire.play("""
-        rx 605  A4 01 2F 00 01 00 00 00   # one segment at a time
-        tx 585  C6 01 2F 00 09 00 00 00   # CRC, nine bytes
-        rx 605  A3 00 00 00 00 00 00 00   # start
-        tx 585  01 31 32 33 34 35 36 37
-        rx 605  A2 01 7F 00 00 00 00 00   # from now on up to 127
-        tx 585  81 38 39 00 00 00 00 00
-        rx 605  A2 01 7F 00 00 00 00 00
-        tx 585  D5 C3 31 00 00 00 00 00   # five bytes are none; CRC
-        rx 605  A1 00 00 00 00 00 00 00
-        rx 605  A1 00 00 00 00 00 00 00   # it is over
-        tx 585  80 00 00 00 01 00 04 05
-    """)
-
-
-def test_what_the_client_has_lost_is_sent_again(wire):
-    written(wire, "AAAAAAABBBBBBBC")
-    wire.play("""
-        rx 605  A0 01 2F 00 7F 00 00 00   # no CRC
-        tx 585  C6 01 2F 00 0F 00 00 00
-        rx 605  A3 00 00 00 00 00 00 00
-        tx 585  01 41 41 41 41 41 41 41
-        tx 585  02 42 42 42 42 42 42 42
-        tx 585  83 43 00 00 00 00 00 00
-        rx 605  A2 01 7F 00 00 00 00 00   # it has the first
-        tx 585  01 42 42 42 42 42 42 42
-        tx 585  82 43 00 00 00 00 00 00
-        rx 605  A2 00 7F 00 00 00 00 00   # and none of these
-        tx 585  01 42 42 42 42 42 42 42
-        tx 585  82 43 00 00 00 00 00 00
-        rx 605  A2 02 7F 00 00 00 00 00
-        tx 585  D9 .. .. 00 00 00 00 00
-        rx 605  A1 00 00 00 00 00 00 00
-    """)
-
-
-def test_nothing_at_all_is_one_segment(wire):
-    wire.play("""
-        rx 605  A4 01 2F 00 7F 00 00 00
-        tx 585  C6 01 2F 00 00 00 00 00
-        rx 605  A3 00 00 00 00 00 00 00
-        tx 585  81 00 00 00 00 00 00 00
-        rx 605  A2 01 7F 00 00 00 00 00
-        tx 585  DD 00 00 00 00 00 00 00
-        rx 605  A1 00 00 00 00 00 00 00
-    """)
-
-
-@pytest.mark.parametrize(("threshold", "switches"), [(0x00, False), (0x08, False), (0x09, True), (0xFF, True)])
-def test_up_to_the_threshold_the_server_switches_to_segments(wire, threshold, switches):
-    written(wire, "123456789")
-    if not switches:
-        wire.play(f"rx 605  A4 01 2F 00 7F {threshold:02X} 00 00\ntx 585  C6 01 2F 00 09 00 00 00")
-        return
-    wire.play(f"""
-        rx 605  A4 01 2F 00 7F {threshold:02X} 00 00
-        tx 585  41 01 2F 00 09 00 00 00
-        rx 605  60 00 00 00 00 00 00 00
-        tx 585  00 31 32 33 34 35 36 37
-        rx 605  70 00 00 00 00 00 00 00
-        tx 585  1B 38 39 00 00 00 00 00
-    """)
-    wire.play("rx 605  A4 81 60 00 7F 04 00 00\ntx 585  43 81 60 00 .. .. .. ..")  # expedited: four bytes
-
-
-@pytest.mark.parametrize(
-    ("step", "code"),
-    [
-        ("A2 01 7F 00 00 00 00 00", "01 00 04 05"),  # before the start
-        ("A1 00 00 00 00 00 00 00", "01 00 04 05"),
-        ("A3 00 00 00 00 00 00 00|A3 00 00 00 00 00 00 00", "01 00 04 05"),  # twice
-        ("A3 00 00 00 00 00 00 00|A2 03 7F 00 00 00 00 00", "03 00 04 05"),  # two were sent
-        ("A3 00 00 00 00 00 00 00|A2 01 00 00 00 00 00 00", "02 00 04 05"),  # blocks of none
-        ("A3 00 00 00 00 00 00 00|A2 01 80 00 00 00 00 00", "02 00 04 05"),
-        ("A3 00 00 00 00 00 00 00|A1 00 00 00 00 00 00 00", "01 00 04 05"),  # before the end
-    ],
-)
-def test_a_wrong_step_ends_an_upload(wire, step, code):
-    written(wire, "123456789")
-    wire.play("rx 605  A4 01 2F 00 7F 00 00 00\ntx 585  C6 01 2F 00 09 00 00 00")
-    *before, last = step.split("|")
-    for one in before:
-        wire.receive(0x605, one)
-    wire.play(f"rx 605  {last}\ntx 585  80 01 2F 00 {code}")
-    wire.play("rx 605  A1 00 00 00 00 00 00 00\ntx 585  80 00 00 00 01 00 04 05")
-
-
 @pytest.mark.parametrize("command", ["81 05", "82 05", "02 05"])
 def test_a_reset_and_a_stop_end_a_block_transfer(wire, command):
     wire.play("rx 605  C2 01 2F 00 15 00 00 00\ntx 585  A4 01 2F 00 7F 00 00 00")
@@ -287,55 +96,6 @@ def test_a_reset_and_a_stop_end_a_block_transfer(wire, command):
 
 
 # --- strings and domains in segments ----------------------------------------------------------------------------------
-def test_a_string_in_segments_both_ways(wire):
-    wire.play("""
-        rx 605  21 00 2F 00 09 00 00 00
-        tx 585  60 00 2F 00 00 00 00 00
-        rx 605  00 61 78 69 73 20 6F 6E   # "axis on"
-        tx 585  20 00 00 00 00 00 00 00
-        rx 605  1B 65 21 00 00 00 00 00   # "e!"
-        tx 585  30 00 00 00 00 00 00 00
-        rx 605  40 00 2F 00 00 00 00 00
-        tx 585  41 00 2F 00 09 00 00 00
-        rx 605  60 00 00 00 00 00 00 00
-        tx 585  00 61 78 69 73 20 6F 6E
-        rx 605  70 00 00 00 00 00 00 00
-        tx 585  1B 65 21 00 00 00 00 00
-        rx 605  2F 00 2F 00 78 00 00 00   # one letter, expedited
-        tx 585  60 00 2F 00 00 00 00 00
-        rx 605  40 00 2F 00 00 00 00 00
-        tx 585  4F 00 2F 00 78 00 00 00
-    """)
-
-
-@pytest.mark.parametrize(
-    ("segments", "code"),
-    [
-        ("10 41 41 41 41 41 41 41", "00 00 03 05"),  # the first has toggle 0
-        ("00 41 41 41 41 41 41 41|00 42 42 42 42 42 42 42", "00 00 03 05"),
-        ("00 41 41 41 41 41 41 41|11 42 42 42 42 42 42 42", "12 00 07 06"),  # 14 bytes, nine were announced
-        ("01 41 41 41 41 41 41 41", "13 00 07 06"),
-    ],
-)
-def test_a_wrong_segment_of_a_string_changes_nothing(wire, segments, code):
-    wire.play("rx 605  21 00 2F 00 09 00 00 00\ntx 585  60 00 2F 00 00 00 00 00")
-    *before, last = segments.split("|")
-    for one in before:
-        assert wire.receive(0x605, one)[0].data[0] & 0xE0 == 0x20
-    wire.play(f"rx 605  {last}\ntx 585  80 00 2F 00 {code}")
-    assert wire.value(TEXT) == "none"
-
-
-def test_a_domain_is_full_at_its_length(wire):
-    wire.play("rx 605  20 01 2F 00 00 00 00 00\ntx 585  60 01 2F 00 00 00 00 00")
-    toggle = 0
-    for _ in range(LONGEST // 7):
-        assert wire.receive(0x605, f"{toggle:02X} 41 41 41 41 41 41 41")[0].data[0] == 0x20 | toggle
-        toggle ^= 0x10
-    wire.play(f"rx 605  {toggle:02X} 41 41 41 41 41 41 41\ntx 585  80 01 2F 00 05 00 04 05")
-    assert wire.value(DATA) == ""
-
-
 @pytest.mark.parametrize("restart", ["81 05", "power"])
 def test_a_text_lives_until_the_firmware_starts_anew(wire, restart):
     written(wire, "left axis", TEXT)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 from rigs.canopen_wire import Wire
 
-from drive_env import EmulatedDrives
 from drive_env.canopen.emergency import QUEUE
 from drive_env.canopen.nmt import NmtState
 from drive_env.devices import find_device
@@ -24,23 +22,6 @@ def wire(drives):
 
 def test_every_cause_and_condition_has_a_row_in_the_device():
     assert set(find_device("tmcm1636").emergencies) == {cause.name for cause in CAUSES} | set(CONDITIONS)
-
-
-def test_a_fault_reset_ends_conditions_of_the_bus(wire):
-    wire.enable()
-    wire.start()
-    wire.drives.machine.enable_input = False
-    wire.play("""
-        rx 305  0F 00 02
-        tx 085  20 63 21 00 FF 00 00 00
-    """)
-    wire.wait(1)
-    assert "085  41 54 A1 00 FF 00 00 00" in map(str, wire.take()), "both in the register"
-    wire.drives.machine.enable_input = True
-    wire.wait(1)
-    wire.receive(0x205, "80 00")
-    wire.wait(1)
-    assert "085  00 00 00 00 00 00 00 00" in map(str, wire.take())
 
 
 def test_a_full_queue_loses_the_newest(wire):
@@ -68,22 +49,6 @@ def test_stopped_tells_later(wire):
         wait 10 ms
         rx 000  80 05
         tx 085  10 81 91 01 FF 00 00 00
-    """)
-
-
-def test_0000h_waits_until_all_errors_are_gone(wire):
-    wire.start()
-    wire.play("""
-        rx 305  00 00 02
-        tx 085  20 63 21 00 FF 00 00 00
-        rx 205  00
-        tx 085  10 82 31 00 FF 00 00 00
-        rx 305  00 00 01
-        wait 1 ms
-        tx 285  50 02 01
-        rx 205  00 00
-        wait 1 ms
-        tx 085  00 00 00 00 00 00 00 00
     """)
 
 
@@ -123,16 +88,6 @@ def test_recovery_without_bus_off_is_nothing(wire):
 
 
 # --- error behaviour --------------------------------------------------------------------------------------------------
-def test_a_warning_is_no_application_error(wire):
-    assert wire.download(0x1029, 2, 0, 1) == 0
-    wire.enable()
-    wire.start()
-    wire.drives.machine.set_temperatures(25.0, 90.0)
-    wire.wait(2)
-    assert "085  10 43 00 01 00 00 00 00" in map(str, wire.take())
-    assert wire.node.state is NmtState.OPERATIONAL
-
-
 @pytest.mark.parametrize("raw", [0, 1])
 def test_in_pre_operational_no_error_changes_the_state(wire, raw):
     assert wire.download(0x1029, 2, raw, 1) == 0
@@ -140,19 +95,3 @@ def test_in_pre_operational_no_error_changes_the_state(wire, raw):
     wire.drives.machine.enable_input = False
     wire.wait(2)
     assert wire.node.state is NmtState.PRE_OPERATIONAL
-
-
-# --- two nodes on one set of drives -----------------------------------------------------------------------------------
-def test_each_node_tells_of_its_own_axes():
-    with EmulatedDrives(load="inertia", num_machines=10, num_threads=1) as drives:
-        first, last = Wire(drives, node_id=1), Wire(drives, node_id=10, first_axis=9)
-        for wire in (first, last):
-            wire.enable()
-        drives.machine.enable_input = np.arange(10) != 9
-        drives.advance(0.001)
-        for wire in (first, last):
-            wire.node.after_cycle(0.001)
-        assert first.take() == []
-        assert [str(f) for f in last.take()] == ["08A  41 54 81 00 FF 00 00 00"]
-        assert first.value(0x6041) & 0x6F == 0x27
-        assert last.value(0x6041) & 0x4F == 0x08

@@ -11,35 +11,6 @@ from drive_env.devices import find_device
 
 
 # --- heartbeat, sent --------------------------------------------------------------------------------------------------
-def test_heartbeat_begins_at_once_and_keeps_its_period(wire):
-    wire.play("""
-        wait 100 ms
-        rx 605  2B 17 10 00 0A 00 00 00   # 10 ms
-        tx 585  60 17 10 00 00 00 00 00
-        wait 1 ms
-        tx 705  7F
-        wait 9 ms
-        wait 1 ms
-        tx 705  7F
-        rx 000  01 05
-        wait 1 ms
-        tx 185  50 02
-        tx 285  50 02 00
-        wait 8 ms
-        wait 1 ms
-        tx 705  05
-        rx 000  02 05
-        wait 30 ms
-        tx 705  04
-        tx 705  04
-        tx 705  04
-        rx 000  80 05
-        rx 605  2B 17 10 00 00 00 00 00
-        tx 585  60 17 10 00 00 00 00 00
-        wait 100 ms
-    """)
-
-
 def test_the_boot_up_message_is_the_first_heartbeat(wire):
     assert wire.download(0x1017, 0, 50, 2) == 0
     assert wire.download(0x1010, 2, 0x65766173, 4) == 0

@@ -38,39 +38,6 @@ def map_pdo(wire, index, objects, can_id=None):
 
 
 # --- the manual's defaults --------------------------------------------------------------------------------------------
-def test_default_receive_pdos(wire):
-    wire.play("""
-        rx 205  06 00                 # RPDO 1: controlword
-        rx 305  07 00 03              # RPDO 2: controlword, mode
-        rx 405  0F 00 10 27 00 00     # RPDO 3: controlword, target position
-        rx 505  0F 00 F0 D8 FF FF     # RPDO 4: controlword, target velocity
-        rx 605  40 60 60 00 00 00 00 00
-        tx 585  4F 60 60 00 03 00 00 00
-        rx 605  40 7A 60 00 00 00 00 00
-        tx 585  43 7A 60 00 10 27 00 00
-        rx 605  40 FF 60 00 00 00 00 00
-        tx 585  43 FF 60 00 F0 D8 FF FF
-    """)
-    assert wire.value(0x6041) & 0x6F == 0x27
-
-
-def test_default_transmit_pdos(wire):
-    wire.play("""
-        rx 080
-        tx 385  50 02 00 00 00 00     # TPDO 3: statusword, position
-        tx 485  50 02 00 00 00 00     # TPDO 4: statusword, velocity
-        rx 605  2F 60 60 00 03 00 00 00
-        tx 585  60 60 60 00 00 00 00 00
-        wait 1 ms
-        tx 285  50 02 03              # TPDO 2: statusword, mode; TPDO 1 has not changed
-        rx 605  2B 40 60 00 06 00 00 00
-        tx 585  60 40 60 00 00 00 00 00
-        wait 1 ms
-        tx 185  31 02
-        tx 285  31 02 03
-    """)
-
-
 def test_operational_tells_event_driven_values_once(wire):
     wire.play("""
         wait 50 ms
@@ -124,47 +91,7 @@ def test_a_repeated_mode_is_ignored_in_an_rpdo_and_refused_by_sdo(wire):
     """)
 
 
-def test_data_that_cannot_be_accepted(wire):
-    wire.play("""
-        rx 305  06 00 02              # no such mode: it stays, and the controlword acts
-        tx 085  20 63 21 00 FF 00 00 00
-        rx 305  06 00 0B              # the same error still: told once
-        rx 605  40 01 10 00 00 00 00 00
-        tx 585  4F 01 10 00 21 00 00 00
-    """)
-    assert (wire.value(0x6041) & 0x6F, wire.value(0x6060)) == (0x21, 0)
-    wire.play("""
-        rx 305  00 00 03              # a good one ends it
-        rx 605  40 01 10 00 00 00 00 00
-        tx 585  4F 01 10 00 00 00 00 00
-        rx 305  00 00 FF
-        tx 085  20 63 21 00 FF 00 00 00
-    """)
-
-
 # --- transmission types -----------------------------------------------------------------------------------------------
-def test_a_synchronous_rpdo_waits_for_sync(wire):
-    configure(wire, 0x1403, 2, 0, 1)
-    wire.play("""
-        rx 505  06 00 01 00 00 00
-        rx 505  06 00 02 00 00 00     # the last one counts
-        rx 605  40 FF 60 00 00 00 00 00
-        tx 585  43 FF 60 00 00 00 00 00
-        rx 080
-        tx 385  31 02 00 00 00 00     # latched before it is sampled
-        tx 485  31 02 00 00 00 00
-        rx 605  40 FF 60 00 00 00 00 00
-        tx 585  43 FF 60 00 02 00 00 00
-        rx 605  23 FF 60 00 09 00 00 00
-        tx 585  60 FF 60 00 00 00 00 00
-        rx 080                        # latched once
-        tx 385  31 02 00 00 00 00
-        tx 485  31 02 00 00 00 00
-        rx 605  40 FF 60 00 00 00 00 00
-        tx 585  43 FF 60 00 09 00 00 00
-    """)
-
-
 def test_what_waits_for_sync_is_forgotten_when_operational_ends(wire):
     configure(wire, 0x1403, 2, 0, 1)
     wire.play("""
@@ -317,33 +244,6 @@ def test_another_type_or_event_timer_does_not_end_the_inhibit_time(wire):
 
 
 # --- identifiers ------------------------------------------------------------------------------------------------------
-def test_an_identifier_changes_at_once(wire):
-    wire.play("""
-        rx 605  23 00 14 01 05 02 00 C0   # off
-        tx 585  60 00 14 01 00 00 00 00
-        rx 205  06 00                     # dead
-        rx 605  23 00 14 01 33 02 00 40   # on, with 233h
-        tx 585  60 00 14 01 00 00 00 00
-        rx 205  06 00                     # nobody's any more
-        rx 233  06 00
-        wait 1 ms
-        tx 185  31 02
-        tx 285  31 02 00
-        rx 605  23 00 18 01 85 01 00 C0
-        tx 585  60 00 18 01 00 00 00 00
-        rx 605  23 00 18 01 99 01 00 40
-        tx 585  60 00 18 01 00 00 00 00
-        wait 1 ms
-        tx 199  31 02
-        rx 605  23 05 10 00 81 00 00 00   # SYNC
-        tx 585  60 05 10 00 00 00 00 00
-        rx 080
-        rx 081
-        tx 385  31 02 00 00 00 00
-        tx 485  31 02 00 00 00 00
-    """)
-
-
 def test_two_rpdos_on_one_identifier(wire):
     configure(wire, 0x1403, 1, 0xC000_0505, 4)
     configure(wire, 0x1403, 1, 0x4000_0405, 4)

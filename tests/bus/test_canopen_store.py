@@ -16,7 +16,7 @@ from drive_env import EmulatedDrives
 from drive_env.canopen.node import Node
 from drive_env.node import store
 
-SAVE, LOAD = "73 61 76 65", "6C 6F 61 64"
+SAVE = "73 61 76 65"
 STORE_FILE = Path(store.__file__)
 
 
@@ -57,42 +57,6 @@ def test_reset_communication_brings_stored_communication_parameters_alone(wire):
 
 
 # --- bit rate and node ID ---------------------------------------------------------------------------------------------
-def test_a_new_node_id_is_stored_by_2706h_and_active_after_a_reset_only(wire):
-    wire.play(f"""
-        rx 605  2F 05 27 00 21 00 00 00   # node 33
-        tx 585  60 05 27 00 00 00 00 00
-        rx 605  2B 04 27 00 FA 00 00 00   # 250 kbit/s
-        tx 585  60 04 27 00 00 00 00 00
-        rx 605  23 06 27 00 {SAVE}
-        tx 585  60 06 27 00 00 00 00 00
-        rx 605  40 08 27 00 00 00 00 00   # not yet
-        tx 585  4F 08 27 00 05 00 00 00
-        rx 605  40 07 27 00 00 00 00 00
-        tx 585  4B 07 27 00 E8 03 00 00
-        rx 000  82 05                     # reset communication is no reset of the module
-        tx 705  00
-        rx 000  81 05
-        tx 721  00
-        rx 605  40 08 27 00 00 00 00 00
-        rx 621  40 08 27 00 00 00 00 00
-        tx 5A1  4F 08 27 00 21 00 00 00
-        rx 621  40 07 27 00 00 00 00 00
-        tx 5A1  4B 07 27 00 FA 00 00 00
-        rx 621  40 14 10 00 00 00 00 00   # predefined identifiers follow
-        tx 5A1  43 14 10 00 A1 00 00 00
-        rx 621  40 00 14 01 00 00 00 00
-        tx 5A1  43 00 14 01 21 02 00 40
-        rx 000  01 05
-        rx 000  01 21
-        wait 1 ms
-        tx 1A1  50 02
-        tx 2A1  50 02 00
-        rx 721  RTR
-        tx 721  05
-    """)
-    assert (wire.node.node_id, wire.node.bit_rate) == (33, 250)
-
-
 def test_the_bit_rate_is_that_of_the_bus_while_none_is_stored(drives):
     wire = Wire(drives, bit_rate=125_000)
     wire.play("""
@@ -169,53 +133,6 @@ def test_a_stored_node_id_replaces_the_given_one(tmp_path, drives):
     assert wire.download(0x2705, 0, 33, 1) == 0
     assert wire.download(0x2706, 0, 0x65766173, 4) == 0
     assert Wire(drives, node_id=5, store=path).node.node_id == 33
-
-
-def test_a_file_that_cannot_be_written_is_a_hardware_error(tmp_path, drives):
-    wire = Wire(drives, store=tmp_path / "missing" / "node.json")
-    before = wire.value(0x6081)
-    assert wire.download(0x6081, 0, 4711, 4) == 0
-    for index, sub in ((0x1010, 1), (0x1010, 4), (0x2706, 0)):
-        assert wire.download(index, sub, 0x65766173, 4) == 0x0606_0000
-    assert wire.download(0x1011, 1, 0x64616F6C, 4) == 0x0606_0000
-    power_cycled(wire)
-    assert wire.value(0x6081) == before, "what was not stored is not kept"
-
-
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        ("", "has no parameters of a tmcm1636"),
-        ("{}", "has no parameters of a tmcm1636"),
-        ("[1, 2]", "has no parameters"),
-        ('{"format": 1, "device": "tmcm6212", "sections": {}}', "it is of format 1 and of a tmcm6212"),
-        ('{"format": 2, "device": "tmcm1636", "sections": {}}', "it is of format 2"),
-        ('{"format": 1, "device": "tmcm1636", "sections": {"profile": {"6081": 1}}}', "has no parameters"),
-        ('{"format": 1, "device": "tmcm1636", "sections": {"profile": {"6081:0": "x"}}}', "has no parameters"),
-        ('{"format": 1, "device": "tmcm1636", "sections": {"profile": {"9999:0": 1}}}', "9999h does not exist"),
-        ('{"format": 1, "device": "tmcm1636", "sections": {"motor 0": {"2003:0": 99999}}}', "highest is 45000"),
-    ],
-)
-def test_another_file_is_refused_and_left_alone(tmp_path, drives, content, words):
-    path = tmp_path / "node.json"
-    path.write_text(content, encoding="utf-8")
-    with pytest.raises(ValueError, match=words) as refused:
-        Node(5, drives, send=print, store=path)
-    assert str(path) in str(refused.value)
-    assert "delete it" in str(refused.value)
-    assert path.read_text(encoding="utf-8") == content
-
-
-def test_what_a_killed_save_left_behind_does_not_matter(tmp_path, drives):
-    path = tmp_path / "node.json"
-    wire = Wire(drives, store=path)
-    assert wire.download(0x6081, 0, 4711, 4) == 0
-    assert wire.download(0x1010, 1, 0x65766173, 4) == 0
-    (tmp_path / "node.json.new").write_text('{"format": 1, "dev', encoding="utf-8")
-    again = Wire(drives, store=path)
-    assert again.value(0x6081) == 4711
-    assert again.download(0x1010, 1, 0x65766173, 4) == 0
-    assert [p.name for p in tmp_path.iterdir()] == ["node.json"]
 
 
 # The child loads store.py alone: a start that takes 30 ms leaves time for 200.

@@ -10,7 +10,6 @@ from rigs.can_devices import (
     DEVICES,
     EACH_AXIS,
     EACH_DEVICE,
-    NODE,
     PROFILE,
     PROFILE_VELOCITY,
     STATUSWORD,
@@ -40,11 +39,6 @@ TEXT = pytest.mark.parametrize(
 def wire(emulated, facts):
     """Node 5, pre-operational."""
     return fresh(emulated(facts.name))
-
-
-def pairs(code):
-    """Return an abort code as a transcript has it."""
-    return code.to_bytes(4, "little").hex(" ").upper()
 
 
 # --- what there is ----------------------------------------------------------------------------------------------------
@@ -228,31 +222,6 @@ def test_a_number_comes_in_segments(wire, facts, axis, size):
     """)
 
 
-@pytest.mark.every(7)
-@EACH_AXIS
-@pytest.mark.parametrize(
-    ("segment", "code"),
-    [
-        ("00 01 02 03 04 05 06 07", TOO_LONG),  # more than the object has, and more to come
-        ("0B 01 02 00 00 00 00 00", TOO_SHORT),  # the last, with two bytes
-        ("17 01 02 03 04 00 00 00", 0x0503_0000),  # toggle
-        ("60 00 00 00 00 00 00 00", 0x0504_0001),  # of an upload
-    ],
-)
-def test_a_wrong_segment_ends_the_download(wire, facts, axis, segment, code):
-    index = PROFILE_VELOCITY + PROFILE * axis
-    before, where = read(wire, facts, index), request(index, 0)
-    wire.play(f"""
-        rx 605  21 {where} 04 00 00 00
-        tx 585  60 {where} 00 00 00 00
-        rx 605  {segment}
-        tx 585  80 {where} {pairs(code)}
-        rx 605  07 78 56 34 12 00 00 00   # it is over
-        tx 585  80 00 00 00 01 00 04 05
-    """)
-    assert read(wire, facts, index) == before
-
-
 @TEXT
 def test_a_text_is_read_in_segments(wire, facts):
     text = facts.text()
@@ -296,35 +265,3 @@ def test_a_block_transfer_is_refused(wire, facts, specifier):
         rx 605  07 01 00 00 00 00 00 00   # what was open is no more
         tx 585  80 00 00 00 01 00 04 05
     """)
-
-
-@EACH_DEVICE
-def test_a_transfer_is_replaced_given_up_and_ended_by_stopped(wire, facts):
-    where, status = request(PROFILE_VELOCITY, 0), request(STATUSWORD, 0)
-    before = read(wire, facts, PROFILE_VELOCITY)
-    wire.play(f"""
-        rx 605  21 {where} 04 00 00 00
-        tx 585  60 {where} 00 00 00 00
-        rx 605  40 {status} 00 00 00 00   # something else in between
-        tx 585  4B {status} .. .. 00 00
-        rx 605  07 01 00 00 00 00 00 00   # the download is no more
-        tx 585  80 00 00 00 01 00 04 05
-        rx 605  21 {where} 04 00 00 00
-        tx 585  60 {where} 00 00 00 00
-        rx 000  02 05                     # stopped
-        rx 605  40 {status} 00 00 00 00
-        rx 000  80 05
-        rx 605  07 01 00 00 00 00 00 00
-        tx 585  80 00 00 00 01 00 04 05
-        rx 605  21 {where} 04 00 00 00
-        tx 585  60 {where} 00 00 00 00
-        wait 999 ms
-        wait 1 ms
-        tx 585  80 {where} 00 00 04 05    # the client was silent for a second
-        rx 606  40 {status} 00 00 00 00   # another node's
-        rx 585  40 {status} 00 00 00 00
-        rx 605  40 {status[:8]}           # no request: it is too short
-        rx 605  RTR
-    """)
-    assert read(wire, facts, PROFILE_VELOCITY) == before
-    assert wire.node.node_id == NODE

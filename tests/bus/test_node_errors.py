@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import pytest
 
 from drive_env.cia402 import State
@@ -104,21 +102,6 @@ def test_the_register_of_a_message_is_its_axis_of_that_moment_and_what_the_other
     assert node.errors.register(without=node.axes[1]) == 0x04 | GENERIC | COMMUNICATION
 
 
-def test_some_devices_show_that_it_is_a_further_axis(other):
-    other.axes[0].error_register = 0x01
-    assert other.errors.register() == 0x01
-    other.axes[1].error_register = 0x20
-    assert other.errors.register() == 0x01 | 0x20 | 0x80
-    other.axes[0].error_register = other.axes[1].error_register = 0
-    assert other.errors.register() == 0
-
-
-def test_some_devices_note_their_own_number_of_an_error(other):
-    other.queue(1, "trajectory", 0x21)
-    other.errors.collect(5.0)
-    assert other.history() == [0x8611 | 1 << 16 | 16 << 24]
-
-
 def test_a_fault_reset_ends_conditions_and_is_no_fault(node):
     node.errors.condition("heartbeat_lost", 1.0)
     node.sink.take()
@@ -208,26 +191,6 @@ def test_the_end_of_a_condition_is_told_of_no_further_axis(node):
     assert node.sink.take() == [(0, (0, 0), 0)]
 
 
-def test_a_lost_network_is_noted_of_each_axis_where_the_history_has_the_device_s_numbers(other):
-    other.errors.condition("heartbeat_lost", 3.0)
-    assert other.history() == [0x8100 | 1 << 16 | 17 << 24, 0x8100 | 17 << 24]
-    other.errors.condition("pdo_too_short", 3.0)
-    assert other.history()[0] == 0x8210
-
-
-def test_a_lost_network_is_an_error_of_the_axes_in_operation(other):
-    """1001h shows with its bit 6 that a further axis has it; of axes that are off it is an error where none is on."""
-    other.axes[0].state = State.OPERATION_ENABLED
-    other.errors.condition("heartbeat_lost", 3.0)
-    assert other.history() == [0x8100 | 17 << 24]
-    assert other.errors.register() == GENERIC | COMMUNICATION
-    other.errors.restart()
-    other.axes[0].state, other.axes[1].state = State.SWITCH_ON_DISABLED, State.OPERATION_ENABLED
-    other.errors.condition("heartbeat_lost", 4.0)
-    assert other.history()[0] == 0x8100 | 1 << 16 | 17 << 24
-    assert other.errors.register() & ~(GENERIC | COMMUNICATION)
-
-
 def test_a_condition_that_a_device_s_table_lacks_is_not_told(node):
     node.errors.condition_if_known("sync_length", 3.0)
     assert node.sink.take() == []
@@ -239,26 +202,6 @@ def test_a_condition_that_a_device_s_table_lacks_is_not_told(node):
 
 
 # --- objects ----------------------------------------------------------------------------------------------------------
-def objects_with(*subs):
-    return SimpleNamespace(readers={}, commands={}, subs=lambda index: list(subs) if index == 0x1003 else [])
-
-
-def test_1001h_and_1003h_show_them(node):
-    objects = objects_with(1, 2)
-    node.errors.add_objects(objects)
-    assert set(objects.readers) == {(0x1001, 0), (0x1003, 0), (0x1003, 1), (0x1003, 2)}
-    node.axes[0].error_register = 0x05
-    assert objects.readers[0x1001, 0]() == 0x05
-    node.queue(0, "following_error", 0x05)
-    node.errors.collect(1.0)
-    assert (objects.readers[0x1003, 0](), objects.readers[0x1003, 1]()) == (1, 0x8611)
-    objects.commands[0x1003, 0](0)
-    assert objects.readers[0x1003, 0]() == 0
-    bare = objects_with()
-    node.errors.add_objects(bare)
-    assert set(bare.readers) == {(0x1001, 0)} and bare.commands == {}
-
-
 def test_the_history_has_the_newest_first_and_so_many():
     history = ErrorHistory(3)
     for code in (0x1000, 0, 0x2000, 0x3000, 0x4000):

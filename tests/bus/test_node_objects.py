@@ -13,11 +13,11 @@ from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.node import store as store_module
 from drive_env.node.axis import ObjectPort
 from drive_env.node.node_dictionary import NodeDictionary
-from drive_env.node.node_objects import NodeObjects, signed_command
+from drive_env.node.node_objects import NodeObjects
 from drive_env.node.parameters import Parameters
 from drive_env.node.store import PowerLostError, Store
 
-SAVE, LOAD = 0x65766173, 0x64616F6C  # "save", "load"
+SAVE = 0x65766173  # "save"
 
 
 class Axis:
@@ -80,25 +80,9 @@ def six():
 
 
 # --- the node's own objects -------------------------------------------------------------------------------------------
-@pytest.mark.parametrize(("index", "sub", "owned"), [
-    (0x1000, 0, True), (0x1800, 1, True), (0x1A03, 0, True), (0x2704, 0, True), (0x2003, 0, False), (0x6041, 0, False),
-])  # fmt: skip
-def test_the_node_owns_objects_of_communication_and_those_that_its_device_names(node, index, sub, owned):
-    assert node.objects.owns(node.dictionary.entries.find((index, sub))) is owned
-
-
 def test_the_areas_of_communication_end_with_1fffh(node):
     for index, owned in ((0x0FFF, False), (0x1000, True), (0x1FFF, True), (0x2000, False)):
         assert node.objects.owns(SimpleNamespace(index=index, sub=0)) is owned
-
-
-def test_a_node_that_starts_has_what_is_stored_or_the_factory_s(node):
-    assert node.read(0x1800, 1) & 0x7FF == 0x185 and node.read(0x1017) == 0
-    node.write(0x1017, 0, 500)
-    assert node.read(0x1017) == 500 and node.changed == [0x1017]
-    node.objects.restore(7, {(0x1016, 1): 0x50064})
-    assert (node.read(0x1017), node.read(0x1016, 1), node.read(0x1800, 1) & 0x7FF) == (0, 0x50064, 0x187)
-    assert node.objects.factory_value(node.objects.find(0x1800, 1)) & 0x7FF == 0x181
 
 
 def test_values_are_numbers_and_0_of_what_is_not_there(node):
@@ -108,19 +92,6 @@ def test_values_are_numbers_and_0_of_what_is_not_there(node):
     assert node.objects.subs(0x1010) == [1, 2, 3, 4] and node.objects.subs(0x1017) == []
 
 
-def test_some_have_readers_and_commands(node):
-    node.objects.readers[0x1001, 0] = lambda: 0x21
-    commanded = []
-    node.objects.commands[0x1017, 0] = commanded.append
-    entry = node.objects.find(0x1017, 0)
-    port = node.objects.port(entry)
-    port.check(65535)
-    with pytest.raises(ObjectAccessError):
-        port.check(65536)
-    port.write(7)
-    assert commanded == [7] and node.read(0x1001) == 0x21 and node.changed == []
-
-
 def test_a_value_is_held_against_its_limits_and_those_that_the_device_takes(six):
     with pytest.raises(ObjectAccessError):
         six.write(0x1017, 0, 65536)
@@ -128,16 +99,6 @@ def test_a_value_is_held_against_its_limits_and_those_that_the_device_takes(six)
     six.write(*key, allowed[0])
     with pytest.raises(ObjectAccessError):
         six.dictionary.port(*key).check(max(allowed) + 1)
-
-
-def test_a_command_wants_its_signature():
-    done = []
-    command = signed_command(SAVE, 0x08000020, lambda: done.append(1))
-    command(SAVE)
-    assert done == [1]
-    with pytest.raises(ObjectAccessError, match=r"^64616F6Ch is not the signature 65766173h ") as error:
-        command(LOAD)
-    assert error.value.abort_code == 0x08000020 and done == [1]
 
 
 # --- which section a parameter is of ----------------------------------------------------------------------------------
@@ -167,21 +128,6 @@ def test_some_devices_store_what_a_pdo_can_carry_unless_it_commands():
     assert kept, "a TGZ keeps profile velocities, which a PDO may carry"
 
 
-def test_a_port_is_that_of_its_axis_with_the_entry_of_the_bus(six):
-    six.axes[2].values[0x6065, 0] = 77
-    port = six.dictionary.port(0x7065, 0)
-    assert port.entry.index == 0x7065 and port.read() == 77 and six.read(0x6065) != 77
-    assert six.dictionary.port(0x7065, 0) is port
-    port.write(78)
-    assert six.axes[2].values[0x6065, 0] == 78
-    with pytest.raises(ObjectAccessError) as error:
-        six.dictionary.port(0x5FFE, 0)
-    assert error.value.abort_code == 0x06020000
-    with pytest.raises(ObjectAccessError) as error:
-        six.dictionary.port(0x6041, 9)
-    assert error.value.abort_code == 0x06090011
-
-
 # --- storing ----------------------------------------------------------------------------------------------------------
 def test_what_has_its_factory_value_is_not_stored(node):
     node.write(0x1017, 0, 500)
@@ -196,31 +142,15 @@ def test_what_has_its_factory_value_is_not_stored(node):
     assert node.axes.stored[0][0x2003, 0] == 815
 
 
-@pytest.mark.parametrize(("sub", "names"), [(2, {"bus", "communication"}), (3, {"profile"}), (4, {"motor 0"})])
-def test_each_group_is_stored_and_restored_alone(node, sub, names):
-    node.axes[0].values[0x2003, 0] = 815
-    node.write(0x1010, sub, SAVE)
-    assert set(node.store.sections) == names
-    node.write(0x1010, 4, SAVE)
-    node.write(0x1011, sub, LOAD)
-    assert all(node.store.sections[name] == {} for name in names)
-    with pytest.raises(ObjectAccessError) as error:
-        node.write(0x1010, sub, LOAD)
-    assert error.value.abort_code == 0x08000020
-    with pytest.raises(ObjectAccessError):
-        node.write(0x1011, sub, SAVE)
-
-
-def test_a_restart_restores_of_each_axis_what_is_stored_and_else_the_factory_s(six):
-    six.store.sections = {"motor 2": {(0x2403, 0): 9}, "profile": {(0x7065, 0): 5}}
-    six.parameters.prepare_restart()
-    stored = six.axes.stored
-    assert len(stored) == 6
-    assert stored[2][0x2003, 0] == 9 and stored[2][0x6065, 0] == 5
-    default = six.dictionary.entries.find(0x6065).default
-    assert stored[0][0x6065, 0] == stored[5][0x6065, 0] == default
-    assert (0x2003, 0) not in stored[0], "motor 0 was never stored"
-    assert not any(0x1000 <= index <= 0x1FFF for one in stored for index, _ in one)
+def test_a_stored_value_that_fits_no_object_is_told(node, tmp_path):
+    node.store.sections = {"communication": {(0x1017, 0): 500}}
+    node.parameters.check(tmp_path)
+    node.store.sections = {"communication": {(0x1017, 0): 70_000}}
+    with pytest.raises(ValueError, match=r"does not fit tmcm1636: .*1017h:00 .*; delete it$"):
+        node.parameters.check(tmp_path)
+    asked = []
+    node.parameters.check(tmp_path, lambda *what: asked.append(what) or True)
+    assert asked == [("communication", (0x1017, 0), 70_000)]
 
 
 def test_a_section_may_make_another_void(node):
@@ -234,6 +164,15 @@ def test_a_section_may_make_another_void(node):
     assert node.store.sections["lss"] == {}
 
 
+def test_a_node_that_starts_has_what_is_stored_or_the_factory_s(node):
+    assert node.read(0x1800, 1) & 0x7FF == 0x185 and node.read(0x1017) == 0
+    node.write(0x1017, 0, 500)
+    assert node.read(0x1017) == 500 and node.changed == [0x1017]
+    node.objects.restore(7, {(0x1016, 1): 0x50064})
+    assert (node.read(0x1017), node.read(0x1016, 1), node.read(0x1800, 1) & 0x7FF) == (0, 0x50064, 0x187)
+    assert node.objects.factory_value(node.objects.find(0x1800, 1)) & 0x7FF == 0x181
+
+
 def test_what_cannot_be_written_is_a_hardware_error(node):
     def fails(changed):
         raise OSError("disk full")
@@ -242,17 +181,6 @@ def test_what_cannot_be_written_is_a_hardware_error(node):
     with pytest.raises(ObjectAccessError, match=r"^the parameters cannot be stored: disk full ") as error:
         node.write(0x1010, 1, SAVE)
     assert error.value.abort_code == 0x06060000 and node.axes.stored is None
-
-
-def test_a_stored_value_that_fits_no_object_is_told(node, tmp_path):
-    node.store.sections = {"communication": {(0x1017, 0): 500}}
-    node.parameters.check(tmp_path)
-    node.store.sections = {"communication": {(0x1017, 0): 70_000}}
-    with pytest.raises(ValueError, match=r"does not fit tmcm1636: .*1017h:00 .*; delete it$"):
-        node.parameters.check(tmp_path)
-    asked = []
-    node.parameters.check(tmp_path, lambda *what: asked.append(what) or True)
-    assert asked == [("communication", (0x1017, 0), 70_000)]
 
 
 # --- the file ---------------------------------------------------------------------------------------------------------

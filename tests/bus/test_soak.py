@@ -30,7 +30,6 @@ from drive_env.firmware.record import get_lanes
 
 MACHINES = 16
 OF_MACHINES = [row.name for row in FAULTS.values() if row.group != "bus" and row.name != "store_interrupted"]
-REV = 65536
 COUNT = 2.0 * np.pi / 4096  # rad of the encoder
 MASKS = np.array([STATE_CODING[state][0] for state in State])
 CODES = np.array([STATE_CODING[state][1] for state in State])

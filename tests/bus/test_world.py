@@ -2,6 +2,7 @@
 
 import random
 from collections import Counter
+from contextlib import contextmanager
 
 import pytest
 
@@ -201,6 +202,19 @@ def test_the_beginning_of_each_cycle_is_told_with_its_time():
     assert begun == pytest.approx([0.001, 0.002, 0.003, 0.004])
 
 
+@contextmanager
+def world_of_a_drive(until=0.01, lockstep=False):
+    """A world whose node 5 is an emulated drive that has booted, and the drive."""
+    world = World(lockstep=lockstep)
+    with EmulatedDrives(load="inertia", num_threads=1) as drives:
+        world.add(drives, [5])
+        world.power_on()
+        if not lockstep:
+            world.run_until(until)
+        yield world, drives
+        world.close()
+
+
 def test_drives_advance_with_the_world():
     world = World(lockstep=False)
     drives = EmulatedDrives(load="inertia", num_threads=1)
@@ -213,67 +227,13 @@ def test_drives_advance_with_the_world():
     twin.close()
 
 
-class Client:
-    """A master that asks a node without pause: the next request leaves with the last one's answer."""
+class Writer:
+    """A master that writes a number to a node's target position, reads it back, and so on, without pause."""
 
     def __init__(self, world, name, node_id):
         self.world, self.name, self.node_id = world, name, node_id
         self.asked, self.answered = 0, 0
         world.listeners.append(self.hear)
-
-    def ask(self):
-        self.asked += 1
-        self.world.receive(request(self.node_id, self.asked), self.name)
-
-    def hear(self, ended):
-        if ended.frame.can_id == 0x580 + self.node_id:
-            self.answered += 1
-            assert ended.frame.data == request(self.node_id, self.answered).data
-            self.ask()
-
-
-def fill_the_bus(duration):
-    """Two masters with open requests to two nodes each, and SYNC with its PDOs: the bus is never idle."""
-    world, _ = echo_world(lockstep=False)
-    for node_id in (1, 2, 3, 4):
-        world.attach(node_id, lambda send, node_id=node_id: Echo(node_id, send))
-    counts = Counter()
-    world.listeners.append(lambda ended: counts.update((ended.frame.can_id,)))
-    clients = [Client(world, f"master {node_id % 2}", node_id) for node_id in (1, 2, 3, 4)]
-    for client in clients:
-        client.ask()
-    for k in range(round(duration * 1000)):
-        world.run_until(k * 0.001)
-        for node in world.nodes.values():
-            node.log.clear()
-        world.receive(SYNC, "producer")
-    world.run_until(duration)
-    return world, clients, counts
-
-
-def check_full_bus(duration):
-    world, clients, counts = fill_the_bus(duration)
-    cycles = round(duration * 1000)
-    assert world.load() == pytest.approx(1.0, abs=0.002)
-    assert world.wire.statistics.frames / duration < 12_000  # SYNC has 51 bits, a PDO of four bytes about 80
-    # SYNC and PDOs have the lower identifiers: none of them waits for a request, and none is lost.
-    assert counts[0x080] in (cycles - 1, cycles)
-    for node_id in (1, 2, 3, 4):
-        assert cycles - 2 <= counts[0x180 + node_id] <= cycles
-        assert cycles - 2 <= counts[0x280 + node_id] <= cycles
-    # SDO gets what is left, and every request got its answer, in order (Client.hear).
-    for client in clients:
-        assert client.asked == client.answered + 1
-    assert sum(client.answered for client in clients) > 100 * duration
-    assert world.wire.statistics.lost == world.wire.statistics.errors == 0
-
-
-def test_a_full_bus_loses_nothing_that_it_can_carry():
-    check_full_bus(1.0)
-
-
-class Writer(Client):
-    """The same to a real node: it writes a number to the target position, reads it back, and so on."""
 
     def ask(self):
         self.asked += 1
@@ -372,20 +332,16 @@ def flood(world, can_id, count):
 
 def test_what_a_node_does_not_take_in_time_fills_its_buffer_and_is_told():
     """Table 303: 8110h with 3. A full bus of SYNC has 20 frames a millisecond, and the firmware takes 16."""
-    world = World(lockstep=False)
-    world.add(EmulatedDrives(load="inertia", num_threads=1), [5])
-    world.power_on()
-    world.run_until(0.01)
-    assert flood(world, 0x080, 300) == [], "64 may wait"
-    assert flood(world, 0x123, 2000) == [], "frames of others do not pass its controller's filters"
-    # Told once until it has caught up, and that it is over.
-    assert flood(world, 0x080, 2000) == ["10 81 11 03 ff 00 00 00", "00 00 00 00 00 00 00 00"]
-    answers = []
-    world.listeners.append(lambda ended: answers.append(str(ended.frame)))
-    world.receive(Frame(0x605, bytes.fromhex("40 01 10 00 00 00 00 00")))
-    world.run_until(world.time + 0.01)
-    assert answers == ["605  40 01 10 00 00 00 00 00", "585  4F 01 10 00 00 00 00 00"]
-    world.close()
+    with world_of_a_drive() as (world, _):
+        assert flood(world, 0x080, 300) == [], "64 may wait"
+        assert flood(world, 0x123, 2000) == [], "frames of others do not pass its controller's filters"
+        # Told once until it has caught up, and that it is over.
+        assert flood(world, 0x080, 2000) == ["10 81 11 03 ff 00 00 00", "00 00 00 00 00 00 00 00"]
+        answers = []
+        world.listeners.append(lambda ended: answers.append(str(ended.frame)))
+        world.receive(Frame(0x605, bytes.fromhex("40 01 10 00 00 00 00 00")))
+        world.run_until(world.time + 0.01)
+        assert answers == ["605  40 01 10 00 00 00 00 00", "585  4F 01 10 00 00 00 00 00"]
 
 
 @pytest.mark.parametrize("command", [0x81, 0x82])
@@ -437,82 +393,56 @@ def answered(world, *requests):
 
 @pytest.mark.parametrize(("request_", "role"), [(READ, "sdo_time"), (SAVE, "store_time")])
 def test_an_sdo_answer_takes_the_time_of_the_device(request_, role):
-    world = World(lockstep=False)
-    drives = EmulatedDrives(load="inertia", num_threads=1)
-    world.add(drives, [5])
-    world.power_on()
-    world.run_until(0.0101)
-    ((took, data),) = answered(world, request_)
-    assert data[:2] in ("4F", "60")
-    frame = 130e-6  # s on the wire at 1 Mbit/s, for the answer itself
-    assert took == pytest.approx(getattr(drives.device.canopen, role) + frame, abs=30e-6)
-    world.close()
+    with world_of_a_drive(until=0.0101) as (world, drives):
+        ((took, data),) = answered(world, request_)
+        assert data[:2] in ("4F", "60")
+        frame = 130e-6  # s on the wire at 1 Mbit/s, for the answer itself
+        assert took == pytest.approx(getattr(drives.device.canopen, role) + frame, abs=30e-6)
 
 
 def test_requests_are_answered_one_after_the_other():
-    world = World(lockstep=False)
-    drives = EmulatedDrives(load="inertia", num_threads=1)
-    world.add(drives, [5])
-    world.power_on()
-    world.run_until(0.01)
-    (_, saved), (took, read) = answered(world, SAVE, READ)
-    assert (saved[:2], read[:2]) == ("60", "4F")
-    assert took > drives.device.canopen.store_time
-    world.close()
+    with world_of_a_drive() as (world, drives):
+        (_, saved), (took, read) = answered(world, SAVE, READ)
+        assert (saved[:2], read[:2]) == ("60", "4F")
+        assert took > drives.device.canopen.store_time
 
 
 @pytest.mark.parametrize("command", [0x02, 0x81, 0x82])
 def test_an_answer_that_is_under_way_ends_with_its_service(command):
     """Stopped has no SDO, and a node that boots has forgotten what it was asked."""
-    world = World(lockstep=False)
-    drives = EmulatedDrives(load="inertia", num_threads=1)
-    world.add(drives, [5])
-    world.power_on()
-    world.run_until(0.01)
-    heard = []
-    world.listeners.append(lambda ended: heard.append(ended.frame.can_id))
-    world.receive(Frame(0x605, bytes.fromhex(SAVE)))
-    world.run_until(0.015)
-    world.receive(Frame(0x000, bytes((command, 5))))
-    world.run_until(0.2)
-    assert 0x585 not in heard and {0x605, 0x000} <= set(heard)
-    world.close()
+    with world_of_a_drive() as (world, _):
+        heard = []
+        world.listeners.append(lambda ended: heard.append(ended.frame.can_id))
+        world.receive(Frame(0x605, bytes.fromhex(SAVE)))
+        world.run_until(0.015)
+        world.receive(Frame(0x000, bytes((command, 5))))
+        world.run_until(0.2)
+        assert 0x585 not in heard and {0x605, 0x000} <= set(heard)
 
 
 def test_in_lockstep_an_sdo_answer_takes_no_time():
-    world = World()
-    world.add(EmulatedDrives(load="inertia", num_threads=1), [5])
-    world.power_on()
-    assert [(took, data[:2]) for took, data in answered(world, SAVE, READ)] == [(0.0, "60"), (0.0, "4F")]
-    world.close()
+    with world_of_a_drive(lockstep=True) as (world, _):
+        assert [(took, data[:2]) for took, data in answered(world, SAVE, READ)] == [(0.0, "60"), (0.0, "4F")]
 
 
 def test_a_reset_switches_the_motor_off_at_once_however_long_the_node_boots():
-    world = World(lockstep=False)
-    drives = EmulatedDrives(load="inertia", num_threads=1)
-    world.add(drives, [5])
-    world.power_on()
-    world.run_until(0.01)
-    motion.enable(drives, mode="pv")
-    assert drives.read(0x6041)[0] & 0x6F == 0x27
-    world.receive(Frame(0x000, b"\x81\x05"))
-    world.run_until(0.012)
-    assert drives.read(0x6041)[0] & 0x6F == 0x40  # switch on disabled
-    assert drives.inside.records["stage_on"][0, 0] == 0.0
-    world.close()
+    with world_of_a_drive() as (world, drives):
+        motion.enable(drives, mode="pv")
+        assert drives.read(0x6041)[0] & 0x6F == 0x27
+        world.receive(Frame(0x000, b"\x81\x05"))
+        world.run_until(0.012)
+        assert drives.read(0x6041)[0] & 0x6F == 0x40  # switch on disabled
+        assert drives.inside.records["stage_on"][0, 0] == 0.0
 
 
 def test_in_lockstep_frames_take_no_time_and_none_is_lost():
-    world = World()
-    world.add(EmulatedDrives(load="inertia", num_threads=1), [5])
-    world.power_on()
-    answers = []
-    world.listeners.append(lambda ended: answers.append(ended.frame.can_id))
-    for _ in range(500):
-        world.receive(Frame(0x605, bytes.fromhex("40 01 10 00 00 00 00 00")))
-    assert answers.count(0x585) == 500
-    assert 0x085 not in answers
-    world.close()
+    with world_of_a_drive(lockstep=True) as (world, _):
+        answers = []
+        world.listeners.append(lambda ended: answers.append(ended.frame.can_id))
+        for _ in range(500):
+            world.receive(Frame(0x605, bytes.fromhex("40 01 10 00 00 00 00 00")))
+        assert answers.count(0x585) == 500
+        assert 0x085 not in answers
 
 
 def test_of_two_masters_the_lower_identifiers_have_the_bus():

@@ -519,16 +519,6 @@ def test_a_restart_restores_stored_values(drives, restart):
     assert drives.read(0x6064)[[0, 2]].tolist() == [0, 0]
 
 
-def test_factory_values_are_those_of_the_eds():
-    with EmulatedDrives(load="inertia", commissioned=False, num_threads=1) as drives:
-        for entry in ENTRIES:
-            if entry.access == "rw" and entry.bits:
-                assert int(drives.read((entry.index, entry.sub))[0]) == entry.default, entry.label
-        drives.write(0x2003, 5_000)
-        drives.reset_node()
-        assert drives.read(0x2003).tolist() == [0]
-
-
 def test_a_preset_is_what_its_file_says(drives):
     preset = DEVICE.preset(find_motor("qbl4208"))
     assert preset["Motor Type"] == 3

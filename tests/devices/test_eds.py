@@ -293,7 +293,6 @@ def entry(od, index, sub):
 
 
 OD = read(NODE)  # read once: the tests below only look
-MAPPINGS = [*range(0x1600, 0x1604), *range(0x1A00, 0x1A04)]
 
 
 @every_row(
@@ -324,42 +323,6 @@ def test_dictionary_and_table_hold_the_same_entries():
     assert {index for index, *_ in GROUPS} == grouped
 
 
-# Rules that no limits tell: identifiers, mapping entries, signatures.
-WITHOUT_LIMITS = {
-    (0x1005, 0), (0x1014, 0), (0x2706, 0), (0x5FFF, 0),
-    *((index, sub) for index in (0x1010, 0x1011) for sub in (1, 2, 3, 4)),
-    *((first + k, 1) for first in (0x1400, 0x1800) for k in range(4)),
-    *((index, sub) for index in MAPPINGS for sub in (1, 2, 3)),
-}  # fmt: skip
-
-
-def test_every_numeric_entry_has_limits_within_its_type_and_a_default_within_them():
-    for found in all_entries(OD):
-        if found.data_type == datatypes.VISIBLE_STRING:
-            continue
-        where = f"{found.index:04X}h sub {found.subindex}"
-        bits = len(found)
-        signed = found.data_type in datatypes.SIGNED_TYPES
-        lowest, highest = (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if signed else (0, 2**bits - 1)
-        assert lowest <= found.default <= highest, where
-        if (found.index, found.subindex) in WITHOUT_LIMITS:
-            assert (found.min, found.max) == (None, None), where
-            continue
-        assert lowest <= found.min <= found.default <= found.max <= highest, where
-
-
-def test_sub_index_0_is_the_largest_sub_index():
-    for index, *_ in GROUPS:
-        subs = OD[index].subindices
-        assert subs[0].data_type == datatypes.UNSIGNED8
-        if index in MAPPINGS:  # there it counts the mapped entries
-            assert subs[0].access_type == "rw"
-            assert subs[0].max == max(subs)
-        else:
-            assert subs[0].access_type == "ro"
-            assert subs[0].default == max(subs)
-
-
 def test_cob_ids_follow_the_node_id():
     cob_ids = [(0x1014, 0)] + [(index + k, 1) for index in (0x1400, 0x1800) for k in range(4)]
     other = read(NODE + 1)
@@ -385,7 +348,7 @@ def test_every_section_has_the_keys_of_its_kind():
         top = eds[f"{found.index:04X}"]["ObjectType"] == "0x7"
         section = eds[f"{found.index:04X}" if top else f"{found.index:04X}sub{found.subindex:X}"]
         wanted = {"ParameterName", "ObjectType", "DataType", "AccessType", "DefaultValue", "PDOMapping"}
-        if found.data_type != datatypes.VISIBLE_STRING and (found.index, found.subindex) not in WITHOUT_LIMITS:
+        if found.min is not None:
             wanted |= {"LowLimit", "HighLimit"}
         assert set(section) - {"Unit"} == wanted
         assert section["ObjectType"] == "0x7"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import itertools
 
 import canopen
 import pytest
@@ -88,29 +87,3 @@ def test_what_can_be_written_has_a_service_behind_it_or_a_reason(name, wire, var
     }
     assert without <= device.unsupported.keys()
     assert name != "tmcm3313" or without == set()
-
-
-def test_the_identity_is_that_of_the_eds(wire, variables):
-    """The emulated serial number is the node-ID."""
-    subs = [one for one in variables.values() if one.index == 0x1018]
-    assert len(subs) > 3
-    for one in subs:
-        assert wire.value(0x1018, one.subindex) == one.default, one.name
-
-
-def test_an_inhibit_time_has_the_unit_of_the_eds(wire, variables):
-    first = min(index for index, _ in variables if 0x1800 <= index < 0x1A00)
-    inhibit = variables[first, 3]
-    cob_id = variables[first, 1].default & 0x7FF
-    for index in {index for index, _ in variables if 0x1800 <= index < 0x1A00}:
-        assert wire.download(index, 1, 0xC0000000 | wire.value(index, 1), 4) == 0
-    assert wire.download(first, 3, 20, 2) == 0
-    assert wire.download(first, 1, 0x40000000 | cob_id, 4) == 0
-    wire.start()
-    times = []
-    for k in range(300):
-        assert wire.download(0x6040, 0, 6 * (k % 2), 2) == 0  # each changes the statusword
-        wire.wait(1)
-        times += [k for frame in wire.take() if frame.can_id == cob_id]
-    apart = {later - before for before, later in itertools.pairwise(times)}
-    assert apart == {{"ms": 20, "100us": 2}[inhibit.unit]}

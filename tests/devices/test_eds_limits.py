@@ -1,6 +1,6 @@
-"""What the EDS promises is what a node takes: every object that can be written, over SDO, at the ends of its range.
+"""Objects that have no limits in the EDS: rows have values that a node takes over SDO and values that it refuses.
 
-What has no limits there is decided by a rule; rows have values that it takes and values that it refuses.
+The others, at the ends of their ranges: test_eds_and_node.py and test_conformance_sdo.py, for every device.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from canopen.objectdictionary import ODVariable
 from rigs.canopen_wire import Wire
 
 from drive_env.devices import find_device
-from drive_env.dictionary.aborts import CANNOT_BE_STORED, NO_SUCH_OBJECT, VALUE_RANGE, VALUE_TOO_HIGH, VALUE_TOO_LOW
-from drive_env.dictionary.entries import INTEGER_TYPES, read_eds
+from drive_env.dictionary.aborts import CANNOT_BE_STORED, NO_SUCH_OBJECT, VALUE_RANGE
+from drive_env.dictionary.entries import read_eds
 
 EDS = find_device("tmcm1636").eds
 WRITABLE = {
@@ -74,8 +74,6 @@ def prepare(drives, key):
             assert wire.download(index, 0, 0, 1) == 0
             for k, raw in enumerate(MAPPED[index >= 0x1A00], 1):
                 assert wire.download(index, k, raw, 4) == 0
-    elif index == 0x6060:  # the same mode twice is refused
-        assert wire.download(0x6060, 0, 3, 1) == 0
     return wire
 
 
@@ -84,19 +82,6 @@ def test_every_object_that_can_be_written_is_in_one_of_the_tables():
     assert len(ruled) == len(set(ruled))
     assert set(WRITABLE) - set(LIMITED) == set(ruled)
     assert len(LIMITED) > 80
-
-
-@pytest.mark.every(5)
-@pytest.mark.parametrize("key", LIMITED, ids=lambda key: f"{key[0]:04X}:{key[1]}")
-def test_a_node_takes_both_ends_of_the_range_and_nothing_beyond(drives, key):
-    low, high = LIMITED[key].min, LIMITED[key].max
-    bits, lowest, highest = INTEGER_TYPES[LIMITED[key].data_type]
-    for raw, code in ((low - 1, VALUE_TOO_LOW), (low, 0), (high, 0), (high + 1, VALUE_TOO_HIGH)):
-        if lowest <= raw <= highest:
-            wire = prepare(drives, key)
-            assert wire.download(*key, raw, bits // 8) == code, raw
-            if code == 0 and key != (0x6040, 0):
-                assert wire.value(*key) == raw
 
 
 @pytest.mark.every(7)

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import re
-import struct
 
 import pytest
-from rigs.scripted_drive import ABORT, ScriptedBus, ScriptedDrive
+from rigs.scripted_drive import ScriptedBus, ScriptedDrive
 
 from drive_env import CanDrives, Limits, motion
 from drive_env.devices import find_device
-from drive_env.fieldbus.errors import RefusedError
 
 TURN = 65536
 VALUES = {(0x2058, 0): (TURN, 4), (0x6085, 0): (1000 * TURN, 4), (0x605A, 0): (2, 2)}
@@ -24,22 +22,6 @@ def listed(index, name, data_type="0x0007"):
 
 LACKING = EDS + listed("607F", "Max profile velocity") + listed("6073", "Max current", "0x0006")
 WRITE_ONLY = re.sub(r"(\[6060\][^\[]*?AccessType=)rw", r"\1wo", EDS)
-
-
-class Particular(ScriptedDrive):
-    """A drive whose RPDOs take one transmission type alone."""
-
-    def __init__(self, kind):
-        super().__init__(values=VALUES)
-        self.kind = kind
-        for k in range(4):
-            self.set(0x1400 + k, kind, 2)
-
-    def _sdo(self, data):
-        command, index, sub = struct.unpack_from("<BHB", data)
-        if 0x1400 <= index < 0x1404 and sub == 2 and command & 0xE0 == 0x20 and data[4] != self.kind:
-            return [(0x580 + self.node, struct.pack("<BHBL", ABORT, index, sub, 0x06090030))]
-        return super()._sdo(data)
 
 
 def turn(drive, path, **options):
@@ -71,17 +53,3 @@ def test_a_drive_turns_whatever_its_eds_says(tmp_path, data, safety):
     path = tmp_path / "foreign.eds"
     path.write_bytes(data)
     turn(ScriptedDrive(values=VALUES), path, safety=safety)
-
-
-@pytest.mark.parametrize("kind", [0, 1])
-def test_an_rpdo_has_the_synchronous_type_that_its_drive_takes(tmp_path, kind):
-    path = tmp_path / "foreign.eds"
-    path.write_text(EDS, encoding="utf-8")
-    assert turn(Particular(kind), path).get(0x1400, 2) == kind
-
-
-def test_an_rpdo_that_takes_no_synchronous_type_is_told(tmp_path):
-    path = tmp_path / "foreign.eds"
-    path.write_text(EDS, encoding="utf-8")
-    with pytest.raises(RefusedError, match="1400h:02 = 0h: the value is out of range"):
-        turn(Particular(255), path)

@@ -6,15 +6,13 @@ import numpy as np
 import pytest
 from rigs.process_image import ProcessImage, write
 
-from drive_env import EmulatedDrives, ObjectAccessError, motion
+from drive_env import EmulatedDrives, motion
 from drive_env.dictionary.aborts import (
     CANNOT_BE_MAPPED,
     NO_SUCH_OBJECT,
-    PDO_LENGTH_EXCEEDED,
     SUB_INDEX_ZERO_IN_USE,
     VALUE_RANGE,
     VALUE_TOO_HIGH,
-    WRONG_STATE,
 )
 
 # Tables 22 and 24; entry 2 of the second is printed 60640008h, and 6064h has 32 bits.
@@ -115,31 +113,6 @@ def test_an_image_takes_effect_at_once_on_all_axes(drives, image):
     np.testing.assert_array_equal(trace[0x6062][-1], [5000, -6000, 7000])
 
 
-def test_of_outputs_that_one_object_does_not_take_the_others_are_taken(drives, image):
-    """A mode that the drive lacks stays what it was."""
-    assert write(image, 0x1C12, 0, 0) == write(image, 0x1600, 0, 0) == 0
-    for sub, word in enumerate((0x607A0020, 0x60600008), 1):
-        assert write(image, 0x1600, sub, word) == 0
-    assert write(image, 0x1600, 0, 2) == write(image, 0x1C12, 0, 1) == 0
-    assert image.output_size == 5
-    assert image.write_outputs((4000).to_bytes(4, "little") + b"\x03")
-    assert not image.write_outputs((5000).to_bytes(4, "little") + b"\x02")
-    assert (drives.read(0x607A)[0], drives.read(0x6060)[0]) == (5000, 3)
-
-
-def test_data_of_another_length_is_a_mistake(image):
-    with pytest.raises(ValueError, match="outputs have 30 bytes as they are mapped, not 29"):
-        image.write_outputs(bytes(29))
-
-
-def test_a_drive_of_can_alone_has_no_image():
-    with (
-        EmulatedDrives("tmcm1636", num_threads=1) as drives,
-        pytest.raises(ValueError, match="tmcm1636 has no process image: its dictionary lacks 1C12h; its process data"),
-    ):
-        ProcessImage(drives)
-
-
 def test_the_image_of_a_second_module_is_its_own():
     with EmulatedDrives("tmcm3313", load="portal", num_machines=2, num_threads=1) as drives:
         assert ProcessImage(drives, first_axis=3).write_outputs(packed({0x687A: 77}))
@@ -147,17 +120,6 @@ def test_the_image_of_a_second_module_is_its_own():
 
 
 # --- rules ------------------------------------------------------------------------------------------------------------
-def test_the_image_is_changed_from_the_outside_in(image):
-    steps = [(0x1C13, 0, 0), (0x1A00, 0, 0), (0x1A00, 1, 0x68640020), (0x1A00, 2, 0x27020020), (0x1A00, 0, 2)]
-    for step in steps:
-        assert write(image, *step) == 0
-    assert image.input_size == 0, "not assigned yet"
-    assert write(image, 0x1C13, 1, 0x1A00) == write(image, 0x1C13, 0, 1) == 0
-    assert image.input_size == 8
-    image.restart()
-    assert (image.input_size, image.dictionary.port(0x1A00, 0).read()) == (30, 9)
-
-
 @pytest.mark.parametrize(
     ("before", "step", "code"),
     [
@@ -205,33 +167,3 @@ def test_gaps_are_bytes_that_nobody_reads(drives, image):
     assert image.read_inputs() == b"\x08" + bytes(3) + int(word).to_bytes(2, "little")
     assert remap(image, (0x00000040, 0x00000040)) == 0
     assert image.output_size == 16 and image.write_outputs(bytes(range(16)))
-
-
-@pytest.mark.parametrize(("words", "code"), [
-    ((0x60600008, 0x00000004, 0x60400010), CANNOT_BE_MAPPED),  # the controlword within a byte
-    ((0x60600008, 0x00000004), CANNOT_BE_MAPPED),  # the next mapping within a byte
-    ((0x60600008, 0x00000041), PDO_LENGTH_EXCEEDED),  # 65 bits
-    ((0x60600008, 0x00000000), NO_SUCH_OBJECT),  # a gap of nothing is none
-])  # fmt: skip
-def test_gaps_that_the_drive_cannot_carry(image, words, code):
-    assert remap(image, words) == code
-    assert (image.dictionary.port(0x1600, 0).read(), image.output_size) == (0, 0)
-
-
-def test_an_entry_that_is_unused_is_checked_when_it_is_used(image):
-    for step in ((0x1C12, 0, 0), (0x1600, 0, 0), (0x1600, 2, 0)):
-        assert write(image, *step) == 0
-    assert write(image, 0x1600, 0, 2) == NO_SUCH_OBJECT
-
-
-def test_it_stays_as_it_is_while_the_node_says_so(drives):
-    states = iter((False, True))
-    image = ProcessImage(drives, may_change=lambda: next(states))
-    assert write(image, 0x1C12, 0, 0) == WRONG_STATE
-    assert write(image, 0x1C12, 0, 0) == 0
-
-
-@pytest.mark.parametrize("key", [(0x1600, 0), (0x1A00, 2), (0x1C00, 1), (0x1C12, 0), (0x1C13, 1)])
-def test_without_it_its_objects_are_read_only(drives, key):
-    with pytest.raises(ObjectAccessError, match="can only be read"):
-        drives.write(key, drives.read(key))

@@ -15,14 +15,13 @@ from rigs.tgz_images import SIZES, rows, structure
 from drive_env import EmulatedDrives, ObjectAccessError, cia402, motion
 from drive_env.bus.world import World
 from drive_env.devices import find_device
-from drive_env.dictionary.aborts import SUB_INDEX_ZERO_IN_USE, VALUE_RANGE
 from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count, to_counts
 from drive_env.drives.speeds import per_increment
 from drive_env.firmware.record import get_lanes
 
 REMOTE = 0x0200
-ENABLED, FAULT = (0x6F, 0x27), (0x4F, 0x08)
+FAULT = (0x4F, 0x08)
 
 # The table of the profile's objects, as printed: index, name, mapping; the second axis lies 800h above.
 PROFILE = """
@@ -338,17 +337,6 @@ def test_the_error_register_tells_kind_and_axis(wire):
             assert wire.value(0x1001, 0) == 0
 
 
-def test_the_error_history_has_code_axis_and_number_the_newest_first(wire):
-    for axis, bit in ((0, 20), (1, 9)):
-        set_errors(wire, *(bit if k == axis else None for k in range(2)))
-    assert wire.value(0x1003, 0) == 2
-    assert wire.value(0x1003, 1) == 9 << 24 | 1 << 16 | 0x4310
-    assert wire.value(0x1003, 2) == 20 << 24 | 0xF001
-    assert wire.download(0x1003, 0, 1, 1) == 0x06090030
-    assert wire.download(0x1003, 0, 0, 1) == 0
-    assert wire.value(0x1003, 0) == 0
-
-
 def test_each_error_bit_makes_one_entry_also_those_of_an_axis_in_fault(wire):
     """M, 1003h: each error bit generates one entry; 1001h has the kinds of all of them."""
     motion.enable(wire.drives, mode="pp")
@@ -437,17 +425,6 @@ def test_a_lost_network_is_an_error_of_the_axis_that_was_in_operation(wire):
     assert wire.value(0x1001, 0) == 0x91
     wire.receive(0, "01 05")
     assert [wire.value(0x1003, sub) for sub in range(2)] == [1, 17 << 24 | 1 << 16 | 0x8100]
-
-
-def test_the_history_holds_sixty_four():
-    from drive_env.node.error_history import ErrorHistory
-
-    depth = sum(entry.index == 0x1003 and entry.sub > 0 for entry in find_device("tgz_d").new_dictionary())
-    assert depth == 64
-    history = ErrorHistory(depth)
-    for code in range(1, 71):
-        history.add(code)
-    assert (history.read(0), history.read(1), history.read(64)) == (64, 70, 7)
 
 
 def test_an_empty_history_is_a_list_of_0_and_no_error_sets_bit_5_of_1001h(wire):
@@ -738,20 +715,6 @@ def test_an_image_has_the_fields_of_its_structure_at_their_bytes(machine, number
             expected = value if other == name else 0
             # The native set-point is 607Ah inside: in the greater units of 608Fh.
             assert raw == expected, (name, other)
-
-
-def test_images_are_selected_in_the_demanded_order_alone(machine):
-    image = ProcessImage(machine)
-    assert write(image, 0x1C12, 1, 0x1702) == SUB_INDEX_ZERO_IN_USE
-    assert write(image, 0x1C12, 0, 0) == 0
-    assert (image.output_size, image.input_size) == (0, 40)
-    assert write(image, 0x1C12, 1, 0x1B01) == VALUE_RANGE  # an image of the other way
-    assert write(image, 0x1C12, 1, 0x1704) == VALUE_RANGE
-    assert write(image, 0x1C12, 1, 0x1721) == 0
-    assert write(image, 0x1C12, 0, 1) == 0
-    assert image.output_size == 44
-    image.restart()
-    assert image.output_size == 40  # what PDO_Out_Mapping_1C12_1 says
 
 
 def test_registers_say_which_images_a_drive_begins_with(machine):

@@ -41,7 +41,7 @@ from rigs.fault_injection import (
 )
 from rigs.world_bus import assert_equal, on_bus
 
-from drive_env import CanDrives, EmulatedDrives, ObjectAccessError, SafetyError, cia402, motion
+from drive_env import CanDrives, EmulatedDrives, SafetyError, cia402, motion
 from drive_env.canopen.frames import Frame
 from drive_env.commands.options import default_samples
 from drive_env.commands.scope import DEFAULT
@@ -153,32 +153,6 @@ def test_the_same_script_gives_the_same_integers_over_the_bus(inside, script, sa
     assert_equal(expected, found)
     moved = np.concatenate(expected, axis=1)[WATCHED.index(0x6064)]
     assert (np.ptp(moved, axis=0) > TURN // 100).all(), "every axis moves"
-
-
-def test_quantities_are_by_the_scales_of_each_axis_over_the_bus(inside):
-    with lockstep(inside) as drives:
-        drives.write((0x6094, 1), [1, 7])
-        drives.write((0x6094, 2), [1000, 2])
-        for name, text, raw in (
-            ("Target velocity", "500 rpm", [500_000, 143]),
-            ("Profile deceleration", "600 rpm/s", [600_000, 171]),
-        ):
-            drives.write(name, text)
-            assert drives.read(name).tolist() == inside.read(name).tolist() == raw
-        drives.write("Target torque", "2 A")
-        peak = inside.read(Role.PEAK_CURRENT) * 1e-3
-        assert drives.read("Target torque").tolist() == np.rint(2.0 * 32767 / peak).astype(int).tolist()
-        with pytest.raises(ObjectAccessError, match="60FFh:00 Target velocity cannot be recorded: no TPDO of tgz_d"):
-            drives.record([0x60FF], 0.001)
-        motion.enable(drives, mode="pv")
-        drives.write("Profile acceleration", "20000 rpm/s")
-        drives.write("Target velocity", "500 rpm")
-        drives.advance(0.3)
-        trace = drives.record([0x606C, 0x6077], 0.1)
-        np.testing.assert_allclose(trace[0x606C, "rpm"].mean(axis=0), [500.0, 500.5], rtol=0.01)
-        raw = trace[0x606C].mean(axis=0)
-        np.testing.assert_allclose(raw, [500_000, 143], rtol=0.01)
-        np.testing.assert_allclose(trace[0x6077, "A"], trace[0x6077] * peak / 32767, rtol=1e-9)
 
 
 def test_what_a_scope_shows_by_default_can_be_recorded(inside):

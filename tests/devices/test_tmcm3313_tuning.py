@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from rigs.commands import drive_tune
 
 from drive_env import EmulatedDrives, cia402, motion
 from drive_env.devices import find_device
@@ -26,7 +26,6 @@ from drive_env.trials.method import check_tried
 from drive_env.trials.open_loop import unmeasured
 from drive_env.trials.position_pid import CLOCK, load_step_error
 from drive_env.trials.positioning import plan_move, start, write_profile
-from tuning.commands.cli import app
 from tuning.runs.experiment import ExperimentError, SweptObject, load_experiment, resolve
 from tuning.runs.metrics import MoveRecording, figures, tracking
 from tuning.runs.sweep import _close_loop, run
@@ -38,10 +37,6 @@ from tuning.target import emulated
 NAME = "qsh4218_51"
 MOTOR = MOTORS[NAME]
 DEVICE = find_device("tmcm3313")
-
-
-def call(*arguments):
-    return CliRunner().invoke(app, [str(argument) for argument in arguments], env={"COLUMNS": "200"})
 
 
 # --- open loop --------------------------------------------------------------------------------------------------------
@@ -57,7 +52,7 @@ def test_its_load_detection_is_that_of_the_tmcm6212_row_by_row():
 
 @pytest.mark.slow
 def test_a_sweep_of_two_currents_has_a_point_for_each_pair(tmp_path):
-    shown = call("sweep", "--device", "tmcm3313", "--load", "inertia", "--show-config").output
+    shown = drive_tune("sweep", "--device", "tmcm3313", "--load", "inertia", "--show-config").output
     grid = shown[shown.index("[[sweep]]") : shown.index("[excitation]")]
     pair = "".join(
         f'[[sweep]]\nobject = "{name}"\nlow = 63\nhigh = 95\ncount = 2\nspacing = "lin"\n\n'
@@ -65,7 +60,7 @@ def test_a_sweep_of_two_currents_has_a_point_for_each_pair(tmp_path):
     )
     config = tmp_path / "two.toml"
     config.write_text(shown.replace(grid, pair), encoding="utf-8")
-    result = call("sweep", "--config", config, "--device", "tmcm3313", "--out", tmp_path / "out")
+    result = drive_tune("sweep", "--config", config, "--device", "tmcm3313", "--out", tmp_path / "out")
     assert result.exit_code == 0, result.output
     lines = (tmp_path / "out" / "results.csv").read_text(encoding="utf-8").splitlines()
     assert lines[0].startswith("2003h:00,2004h:00,")
@@ -110,7 +105,7 @@ def test_an_episode_of_gain_tuning():
 
 @pytest.mark.slow
 def test_auto_commissions_and_certifies_load_detection_and_closed_loop(tmp_path, monkeypatch):
-    result = call("auto", "--device", "tmcm3313", "--motor", NAME, "--load", "inertia", "--out", tmp_path / "out")
+    result = drive_tune("auto", "--device", "tmcm3313", "--motor", NAME, "--load", "inertia", "--out", tmp_path / "out")
     assert result.exit_code == 0, result.output
     axis = json.loads((tmp_path / "out" / "stepper-certificate.json").read_text(encoding="utf-8"))["axes"][0]
     assert axis["verdict"] == "accepted" and axis["figures"]["teeth lost at an obstacle"] == 0
@@ -133,7 +128,7 @@ def test_gains_that_won_by_noise_are_not_kept(tmp_path, monkeypatch):
         return SimpleNamespace(gains=gains, cost=np.array([0.0]), rows=(), rule=gains)
 
     monkeypatch.setattr("tuning.stepper.closed_loop.optimise", praise)
-    result = call("auto", "--device", "tmcm3313", "--motor", NAME, "--load", "inertia", "--out", tmp_path / "out")
+    result = drive_tune("auto", "--device", "tmcm3313", "--motor", NAME, "--load", "inertia", "--out", tmp_path / "out")
     assert result.exit_code == 0, result.output
     axis = json.loads((tmp_path / "out" / "stepper-certificate.json").read_text(encoding="utf-8"))["axes"][0]
     assert axis["verdict"] == "accepted with reservations"
@@ -160,7 +155,7 @@ def test_a_closed_loop_whose_every_trial_is_stopped_is_not_certified(tmp_path, m
 
     monkeypatch.setattr("tuning.stepper.closed_loop.optimise", search)
     monkeypatch.setattr("tuning.stepper.closed_loop.TrialBench", Stopped)
-    result = call("auto", "--device", "tmcm3313", "--motor", NAME, "--load", "inertia", "--out", tmp_path / "out")
+    result = drive_tune("auto", "--device", "tmcm3313", "--motor", NAME, "--load", "inertia", "--out", tmp_path / "out")
     assert result.exit_code == 0, result.output
     axis = json.loads((tmp_path / "out" / "stepper-certificate.json").read_text(encoding="utf-8"))["axes"][0]
     assert axis["verdict"] == "accepted with reservations"
@@ -472,7 +467,7 @@ def test_a_sweep_of_the_pid_measures_no_current_and_says_so(tmp_path):
     few = replace(shipped, sweep=(replace(shipped.sweep[0], count=3), replace(shipped.sweep[1], count=2)))
     config = tmp_path / "pid.toml"
     config.write_text(few.to_toml({}), encoding="utf-8")
-    said = call("sweep", "--config", config, "--out", tmp_path / "out")
+    said = drive_tune("sweep", "--config", config, "--out", tmp_path / "out")
     assert said.exit_code == 0, said.output
     assert "No torque current is measured (a PID does not commutate" in said.output
     result = run(load_experiment(tmp_path / "out" / "settings.toml"), num_threads=1)
@@ -506,5 +501,5 @@ def test_a_sweep_by_objects_closes_the_first_loop_in_which_they_act():
     ],
 )
 def test_a_loop_that_cannot_be_closed_is_refused_with_the_reason(arguments, said, tmp_path):
-    result = call("sweep", "--closed-loop", *arguments, "--out", tmp_path / "out")
+    result = drive_tune("sweep", "--closed-loop", *arguments, "--out", tmp_path / "out")
     assert result.exit_code != 0 and said in result.output and "Traceback" not in result.output

@@ -100,23 +100,6 @@ def test_twelve_motors_need_two_nodes_and_seven_leave_five_axes():
         World().add(drives, [1])
 
 
-def test_the_store_of_a_node_holds_all_of_its_axes():
-    """Axis 0 has a motor, axis 5 has none: both are saved, and both come back."""
-    world = World(lockstep=True)
-    (node,) = world.add(machine("inertia"), [1])
-    port = lambda index, sub=0: node.dictionary.port(index, sub)  # noqa: E731
-    world.power_on()
-    for index, raw in ((0x2003, 77), (0x2A03, 99)):
-        port(index).write(raw)
-    for group in (4, 9):
-        port(0x1010, group).write(0x65766173)
-    for index in (0x2003, 0x2A03):
-        port(index).write(11)
-    node.power_on(0.0)
-    assert (port(0x2003).read(), port(0x2A03).read()) == (77, 99)
-    world.close()
-
-
 def test_six_axes_that_fault_at_once_are_told_one_by_one():
     """Two messages each: more than the eight of a node with one axis."""
     emulated = machine("inertia", AXES)

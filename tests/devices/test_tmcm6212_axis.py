@@ -15,7 +15,6 @@ from drive_env.dictionary.entries import ObjectDictionary
 
 DEVICE, AXES = find_device("tmcm6212"), 6
 TURN = 51_200
-ENABLED, FAULT = 0x27, 0x08
 
 
 @pytest.fixture
@@ -38,23 +37,6 @@ def enable(wire, *axes):
             assert wire.download(of(0x6040, axis), 0, word, 2) == 0
 
 
-def test_when_nmt_is_stopped_enabled_axes_go_to_fault_and_no_other(wire):
-    """Section 2.2: all DS402 state machines that are in operation enabled; axis 3 is on its way there."""
-    assert wire.download(of(0x200A, 3), 0, 50, 2) == 0
-    enable(wire, 0, 2, 5)
-    for word in (6, 7):
-        assert wire.download(of(0x6040, 1), 0, word, 2) == 0
-    wire.wait(100)
-    enable(wire, 3)
-    wire.start()
-    wire.wait(10)
-    assert states(wire) == [0x07, 0x03, 0x07, 0x03, 0x40, 0x07]
-    wire.receive(0, "02 05")
-    wire.wait(100)
-    assert states(wire) == [FAULT, 0x03, FAULT, FAULT, 0x40, FAULT]
-    assert wire.drives.inside.records["stage_on"].sum() == 0.0
-
-
 @pytest.mark.parametrize("key", ["3000:0", "3001:0"])
 def test_what_no_source_explains_is_refused_with_the_reason(wire, key):
     index = int(key[:4], 16)
@@ -69,13 +51,6 @@ def test_what_no_source_explains_is_refused_with_the_reason(wire, key):
 def test_the_os_command_takes_none(wire):
     assert wire.download(0x1023, 1, 0x6C, 1) >= 0x06000000
     assert wire.value(0x1023, 2) == 0
-
-
-def test_settings_of_encoder_and_brake_are_written_in_switch_on_disabled_only(wire):
-    enable(wire, 4)
-    for index, sub in ((0x200B, 1), (0x200B, 2), (0x200B, 3), (0x200C, 1), (0x200C, 2)):
-        assert wire.download(of(index, 4), sub, 1, 1) == 0x08000022
-        assert wire.download(of(index, 1), sub, 1, 1) == 0
 
 
 def test_each_axis_has_a_brake_output_of_its_own(wire):

@@ -6,8 +6,6 @@ import pytest
 from rigs.canopen_wire import Wire
 
 from drive_env import EmulatedDrives
-from drive_env.bus.bits import frame_bits
-from drive_env.bus.wire import Wire as Bus
 from drive_env.bus.world import World
 from drive_env.canopen.frames import Frame
 from drive_env.cia402 import State, state_of
@@ -16,7 +14,6 @@ from drive_env.dictionary.aborts import WRONG_STATE
 AXES = 6
 EACH = range(AXES)
 PROFILE, MOTOR, PDO = 0x800, 0x200, 0x40  # from an axis to the next
-OFF = 0x8000_0000
 DISABLED, ENABLED, FAULT = State.SWITCH_ON_DISABLED, State.OPERATION_ENABLED, State.FAULT
 
 
@@ -54,50 +51,6 @@ def test_limit_switches_and_units_are_chosen_before_an_axis_is_enabled(wire, axi
     assert wire.download(0x2005 + MOTOR * axis, 0, 0, 4) == WRONG_STATE
     other = (axis + 1) % AXES
     assert wire.download(0x2005 + MOTOR * other, 0, 3, 4) == 0, "that is its own affair"
-
-
-# --- PDO --------------------------------------------------------------------------------------------------------------
-
-
-def give(wire, index, can_id, kind=None, objects=None):
-    """Give a PDO an identifier, a transmission type, and objects: off, none, these, their number, on."""
-    assert wire.download(index, 1, can_id | OFF, 4) == 0
-    if kind is not None:
-        assert wire.download(index, 2, kind, 1) == 0
-    if objects is not None:
-        assert wire.download(index + 0x200, 0, 0, 1) == 0
-        for sub, raw in enumerate(objects, 1):
-            assert wire.download(index + 0x200, sub, raw, 4) == 0
-        assert wire.download(index + 0x200, 0, len(objects), 1) == 0
-    assert wire.download(index, 1, can_id, 4) == 0
-
-
-def test_thirty_frames_per_sync_take_four_milliseconds_of_a_bus_of_1_mbit_s(wire):
-    """24 sent PDOs and six received ones: too many for a cycle of 1 ms, not for one of 4 ms."""
-    for axis in EACH:
-        for place in range(4):
-            give(wire, 0x1800 + PDO * axis + place, 0x300 + 4 * axis + place, 1)
-        give(wire, 0x1402 + PDO * axis, 0x211 + axis)
-    sync = Frame(0x80)
-    targets = [Frame(0x211 + axis, bytes.fromhex("0F 00 D2 04 00 00")) for axis in EACH]
-    wire.start()
-    wire.take()
-    for frame in targets:
-        wire.node.receive(frame, wire.now)
-    answers = wire.receive(0x80)
-    assert len(answers) == 24
-    bits = [frame_bits(frame) for frame in (sync, *targets, *answers)]
-    took = sum(bits) / 1e6
-    assert 0.002 < took < 0.004, "s"
-    bus = Bus(1_000_000)
-    for k, frame in enumerate((sync, *targets, *answers)):
-        bus.send(frame, k, 0.0)
-    time, count = 0.0, 0
-    while (event := bus.next_event()) < 1.0:
-        time = event
-        count += bus.take(time) is not None
-    assert count == 31
-    assert time == pytest.approx(took, rel=0.02)
 
 
 # --- EMCY -------------------------------------------------------------------------------------------------------------

@@ -20,8 +20,7 @@ from drive_env.canopen.frames import Frame
 from drive_env.commands.cli import app
 from drive_env.devices import find_device
 from drive_env.devices.variants import merged
-from drive_env.dictionary.aborts import CANNOT_BE_STORED, READ_ONLY, VALUE_RANGE, VALUE_TOO_HIGH, VALUE_TOO_LOW
-from drive_env.dictionary.entries import INTEGER_TYPES, read_eds
+from drive_env.dictionary.aborts import CANNOT_BE_STORED, READ_ONLY, VALUE_RANGE
 from drive_env.drives.limits import Limits
 from drive_env.drives.speeds import per_increment
 from drive_env.fieldbus.errors import BusError
@@ -80,9 +79,7 @@ ROWS = [
 ]
 KEYS = {row[:2] for row in ROWS}
 ENTRIES = {(entry.index, entry.sub): entry for entry in VARIANT.new_dictionary()}
-OD = read_eds(VARIANT.eds)
 BY_RULE = {(0x1005, 0), (0x1014, 0), (0x2706, 1), *((0x1800 + k, 1) for k in range(4))}  # without limits in the EDS
-WRITABLE = sorted(key for key in KEYS - BY_RULE if ENTRIES[key].access == "rw")
 
 
 def values(entry):
@@ -390,28 +387,6 @@ def test_its_sync_is_obeyed(drives):
     wire.node.receive(Frame(0x80, b""), wire.now)
     wire.wait(1)
     assert 0x185 in [frame.can_id for frame in wire.take()]
-
-
-@pytest.mark.every(7)
-@pytest.mark.parametrize(
-    "key",
-    sorted(key for key in KEYS - BY_RULE if ENTRIES[key].access == "rw"),
-    ids=lambda key: f"{key[0]:04X}:{key[1]}",
-)
-def test_a_node_takes_both_ends_of_the_range_and_nothing_beyond(drives, key):
-    entry = ENTRIES[key]
-    bits, lowest, highest = INTEGER_TYPES[od_entry(OD, *key).data_type]
-    for raw, code in (
-        (entry.low - 1, VALUE_TOO_LOW),
-        (entry.low, 0),
-        (entry.high, 0),
-        (entry.high + 1, VALUE_TOO_HIGH),
-    ):
-        if lowest <= raw <= highest:
-            wire = Wire(drives)
-            assert wire.download(*key, raw, bits // 8) == code, raw
-            if code == 0:
-                assert wire.value(*key) == raw
 
 
 def programme(drives):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import permutations
+
 import numpy as np
 import pytest
 from rigs.truth import field
@@ -460,15 +462,7 @@ def test_quick_stop_brakes_with_6085h_and_ends_in_switch_on_disabled(drives, mod
     assert (np.abs(trace[0x606C][-20:]) < 20_000).all()
 
 
-CHANGES = [
-    (before, after)
-    for before in ("csp", "csv", "cst", "pp", "pv")
-    for after in ("csp", "csv", "cst", "pp", "pv")
-    if before != after and (before[0] == "c" or after[0] == "c")
-]
-
-
-@pytest.mark.parametrize(("before", "after"), CHANGES)
+@pytest.mark.parametrize(("before", "after"), permutations(("csp", "csv", "cst", "pp", "pv"), 2))
 def test_changing_the_mode_in_motion_does_not_jump(drives, before, after):
     """The new mode's first targets continue the motion; speed, demand and current stay near what they were."""
     speed = 500_000

@@ -448,11 +448,6 @@ def test_without_a_method_or_a_speed_it_ends_at_once_and_nothing_moves(belt, mis
     np.testing.assert_allclose(carriage(belt), 0.1, atol=5e-4)
 
 
-def test_method_and_speeds_are_0_from_factory():
-    factory = EmulatedDrives(load="belt", commissioned=False)
-    assert [int(factory.read(name)[0]) for name in (0x6098, (0x6099, 1), (0x6099, 2), 0x609A, 0x607C)] == [0] * 5
-
-
 # --- method 35 --------------------------------------------------------------------------------------------------------
 @pytest.mark.parametrize("enabled", [False, True])
 def test_method_35_takes_the_present_position_for_zero_and_does_not_move(belt, enabled):
@@ -505,20 +500,6 @@ def test_2140h_tells_home_in_encoder_increments_without_607ch(belt):
     np.testing.assert_allclose(belt.read(0x2140), HOME_LOW / ENCODER_COUNT, atol=TOLERANCE / ENCODER_COUNT + 2)
     belt.machine.power_cycle()
     assert (belt.read(0x2140) == 0).all()
-
-
-def test_after_homing_moves_go_to_the_new_coordinates(belt):
-    bring(belt, 0.1)
-    set_up(belt, 17)
-    belt.write(0x607C, round(0.01 * INC))
-    start(belt)
-    wait(belt)
-    belt.write(0x6040, 0x0F)
-    belt.write(0x6060, 1)
-    target = np.linspace(0.02, 0.3, COUNT)
-    motion.move_to(belt, np.rint(target * INC).astype(int))
-    belt.advance(0.3)
-    np.testing.assert_allclose(carriage(belt), LEFT + 0.01 + target, atol=3e-4)
 
 
 SLOW_DOWN, QUICK_STOP, DISABLE = 5, 0x0B, 0x07

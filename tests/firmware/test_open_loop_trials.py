@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rigs.commands import drive_tune
 from rigs.stepper_rig import BARE
-from typer.testing import CliRunner
 
 from drive_env import cia402
 from drive_env.devices import find_device
@@ -29,7 +29,6 @@ from drive_env.phase_current import (
 from drive_env.trials.method import OpenLoop, check_tried, method_of
 from drive_env.trials.open_loop import OpenLoopTerms, open_loop_cost
 from drive_env.trials.score import STEPPER_VARIANTS, VARIANTS
-from tuning.commands.cli import app
 from tuning.search.optimise import Settings, optimise
 from tuning.search.trial_bench import TrialBench
 from tuning.target import emulated
@@ -207,16 +206,10 @@ def test_a_variant_of_the_run_current_is_the_steppers_alone():
 
 
 # --- the commands ---------------------------------------------------------------------------------------------------
-def run(*arguments):
-    result = CliRunner().invoke(app, [*map(str, arguments)], env={"COLUMNS": "200"})
-    assert "Traceback" not in result.output
-    return result
-
-
 @pytest.mark.slow
 def test_sweep_runs_the_open_loop_experiment_says_what_is_not_measured_and_repeats(stepper, tmp_path):
     first, again = tmp_path / "first", tmp_path / "again"
-    result = run("sweep", "--device", stepper, "--out", first)
+    result = drive_tune("sweep", "--device", stepper, "--out", first)
     assert result.exit_code == 0, result.output
     assert "No torque current is measured (no 6077h)" in result.output
     with (first / "results.csv").open(encoding="utf-8") as file:
@@ -229,13 +222,13 @@ def test_sweep_runs_the_open_loop_experiment_says_what_is_not_measured_and_repea
         if held < 0.1:  # N m, less than the load step: steps are lost
             assert row["fault"] == "1" and row["score [s]"] == "inf"
     assert any(row["fault"] == "0" for row in rows)
-    assert run("sweep", "--config", first / "settings.toml", "--out", again).exit_code == 0
+    assert drive_tune("sweep", "--config", first / "settings.toml", "--out", again).exit_code == 0
     assert (first / "results.csv").read_bytes() == (again / "results.csv").read_bytes()
 
 
 def test_optimise_says_which_terms_j_has_not(stepper, tmp_path):
     out = tmp_path / "found"
-    result = run("auto", "--by", "tpe", "--device", stepper, "--motor", NAME, "--load", "inertia", "--trials", 4,
+    result = drive_tune("auto", "--by", "tpe", "--device", stepper, "--motor", NAME, "--load", "inertia", "--trials", 4,
                  "--machines", 2, "--objective", "speed", "--objective", "current", "--out", out)  # fmt: skip
     assert result.exit_code == 0, result.output
     assert "no load step and no ripple" in result.output
@@ -255,7 +248,7 @@ def test_optimise_says_which_terms_j_has_not(stepper, tmp_path):
 def test_commands_refuse_in_one_line_before_anything_moves(stepper, command, reason, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     motor = ("--motor", NAME, "--load", "inertia") if command[0] != "sweep" else ("--motor", NAME)
-    result = run(*command, "--device", stepper, *motor)
+    result = drive_tune(*command, "--device", stepper, *motor)
     assert result.exit_code == 2 and reason in result.output
     assert not list(Path(tmp_path).iterdir())
 

@@ -101,19 +101,6 @@ def test_what_is_refused_is_refused_with_the_same_code(name, value):
     assert found.value.abort_code == expected.value.abort_code
 
 
-def test_the_same_mode_twice_is_refused_alike():
-    def twice(drives):
-        drives.write(0x6060, 3)
-        with pytest.raises(ObjectAccessError) as error:
-            drives.write(0x6060, 3)
-        return error.value.abort_code
-
-    with EmulatedDrives(load="inertia", num_threads=1) as drives:
-        expected = twice(drives)
-    with served("calls", load="inertia") as drives:
-        assert twice(drives) == expected == 0x08000022
-
-
 def test_a_reset_restores_the_stored_values_and_goes_on():
     def reset(drives):
         drives.write(0x6081, 12345)

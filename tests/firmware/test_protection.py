@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from drive_env import EmulatedDrives, motion
-from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.firmware.record import get_lanes, set_lanes
 
 FIRST = np.array([True, False])
@@ -344,23 +343,6 @@ def test_fault_comes_by_its_cause_and_goes_after_it(name):
         assert messages(drives) == []
 
 
-@pytest.mark.parametrize("name", ["open load A", "open load B"])
-def test_fault_reaction_ramps_down_with_6085h(name):
-    """605Eh: the ramp starts from the speed that the axis still has; table 127 knows no other reaction."""
-    row = ROWS[name]
-    with EmulatedDrives(load="inertia", num_machines=2) as drives:
-        row.start(drives)
-        row.cause(drives)
-        trace = drives.record([0x6041, 0x6062], row.within)
-    first = int(np.argmax(trace[0x6041][:, 0] & STATE == REACTION_ACTIVE))
-    speed = np.diff(trace[0x6062][first:, 0])  # inc per ms
-    steps = int(speed[0] / (QUICK * 1e-6))
-    assert 2 <= steps <= FAST / QUICK * 1e3
-    # Seen through positions rounded to increments.
-    assert np.all(abs(-np.diff(speed)[: steps - 1] - QUICK * 1e-6) <= 2.0)
-    assert np.all(speed[steps + 2 : 20] == 0)
-
-
 @pytest.mark.parametrize("name", [name for name, row in ROWS.items() if row.reaction == CUT and row.start is turn])
 def test_stage_is_cut_within_a_millisecond_and_the_rotor_coasts(name):
     row = ROWS[name]
@@ -389,21 +371,6 @@ def test_neighbour_does_not_notice(name):
             trace = drives.record([0x6041, 0x6064, 0x606C, 0x6077, 0x2101], 0.3)
             traces.append([trace[key][:, 1] for key in (0x6041, 0x6064, 0x606C, 0x6077, 0x2101)])
     assert np.array_equal(traces[0], traces[1])
-
-
-def test_fault_in_standstill_needs_no_ramp_and_reset_needs_the_edge():
-    with EmulatedDrives(load="inertia", num_machines=2) as drives:
-        motion.enable(drives, mode="pv")
-        drives.write(0x6040, 0x8F, where=FIRST)
-        drives.machine.enable_input = np.array([False, True])
-        drives.advance(0.002)
-        drives.machine.enable_input = True
-        drives.advance(0.002)
-        drives.write(0x6040, 0x8F, where=FIRST)  # bit 7 stays set: no edge
-        drives.advance(0.002)
-        assert state(drives) == FAULT
-        reset_edge(drives)
-        assert state(drives) == 0x40
 
 
 def test_no_fault_before_somebody_switches_on():
@@ -622,41 +589,6 @@ def test_axis_that_its_load_pushes_past_a_software_limit_tells_and_can_be_led_ba
         assert bits(drives, INTERNAL_LIMIT) == 0
 
 
-def test_positions_beyond_a_software_limit_are_not_approached():
-    """pp and csp know the target: they end at the corrected limit with bit 11 set, and send nothing."""
-    for mode in ("pp", "csp"):
-        with EmulatedDrives(load="inertia", num_machines=2) as drives:
-            drives.write("Home offset", 50_000)
-            drives.write("Software position limit.Maximum Position Limit", 300_000)
-            motion.enable(drives, mode=mode)
-            if mode == "pp":
-                drives.write(0x607A, 400_000)
-                drives.write(0x6040, 0x1F)
-                drives.advance(1.5)
-            else:
-                ramp = np.minimum(np.arange(1, 1501) * 400, 400_000)
-                drives.record([0x6041], 1.5, play={0x607A: ramp})
-            assert np.all(drives.read(0x6062) == 250_000)
-            assert np.all(abs(drives.read(0x6064) - 250_000) < 300)
-            assert bits(drives, INTERNAL_LIMIT) == INTERNAL_LIMIT
-            assert messages(drives) == []
-
-
-def test_homing_may_touch_the_switches():
-    """Table 303, FF01h: "touched outside of the homing function"."""
-    with EmulatedDrives(load="belt", num_machines=2) as drives:
-        drives.write("Homing method", 17)
-        drives.write("Homing speeds.Fast homing speed", 300_000)
-        drives.write("Homing speeds.Slow homing speed", 30_000)
-        drives.write("Homing acceleration", 30_000_000)
-        motion.enable(drives, mode="hm")
-        drives.write(0x6040, 0x1F)
-        pressed = drives.record([0x60FD], 2.5)[0x60FD] & 1
-        assert pressed.max() == 1
-        assert messages(drives) == []
-        assert state(drives) == ENABLED
-
-
 # --- supply ---------------------------------------------------------------------------------------------------------
 def test_brake_chopper_takes_what_braking_gives():
     """2006h: on above the voltage, off below voltage minus hysteresis; without it the same braking ends in 3210h."""
@@ -782,21 +714,6 @@ def test_inverted_switch_is_active_while_not_pressed(settings, forbidden, extra)
         drives.advance(0.2)
         assert np.all(-forbidden * drives.read(0x6064) > 30_000)
         assert np.all(drives.read(0x60FD) & 0b11 == 0)  # levels, not what 2005h makes of them
-
-
-@pytest.mark.parametrize("words", [(0x06,), (0x06, 0x07), (0x06, 0x07, 0x0F)])
-def test_limit_switches_are_written_in_switch_on_disabled_only(words):
-    """Section 4.1.4; abort code 08000022h: because of the present device state."""
-    with EmulatedDrives(load="inertia", num_machines=2) as drives:
-        drives.advance(0.002)
-        drives.write(0x2005, 2)
-        for word in words:
-            drives.write(0x6040, word)
-            drives.advance(0.002)
-        with pytest.raises(ObjectAccessError) as refused:
-            drives.write(0x2005, 3)
-        assert refused.value.abort_code == 0x0800_0022
-        assert drives.read(0x2005).tolist() == [2, 2]
 
 
 def test_load_stronger_than_the_motor_is_a_following_error():

@@ -14,7 +14,6 @@ from drive_env import CanDrives, EmulatedDrives, ObjectAccessError, motion
 from drive_env.bus.world import World
 from drive_env.devices import FOLDER, find_device
 from drive_env.fieldbus.description import describe
-from drive_env.fieldbus.errors import BusError
 from drive_env.master.can.port import Port
 from drive_env.master.can.sdo import SdoClient
 
@@ -91,17 +90,15 @@ def test_bytes_that_are_none_are_told(tmp_path):
 
 
 # --- process data -----------------------------------------------------------------------------------------------------
-PLAYED, SAMPLED = (0x607A,), (0x6041, 0x6064, 0x606C)
+SAMPLED = (0x6041, 0x6064, 0x606C)
 
 
 @contextmanager
-def served(nodes=(1,), more=()):
-    """Nodes of the module on a bus in lockstep, and single drives at `more`."""
+def served(nodes=(1,)):
+    """Nodes of the module on a bus in lockstep."""
     world = World(lockstep=True)
     emulated = EmulatedDrives(MODULE.name, load="inertia", num_machines=AXES * len(nodes), num_threads=1, seed=4)
     world.add(emulated, list(nodes))
-    if more:
-        world.add(EmulatedDrives(load="inertia", num_machines=len(more), num_threads=1), list(more))
     bus = WorldBus(world)
     try:
         yield world, bus
@@ -155,24 +152,6 @@ def test_pdos_of_further_axes_borrow_identifiers_and_give_them_back():
             assert [during[0x1800 + 0x40 * axis] & 0x7FF for axis in range(AXES)] == [0x181 + k for k in range(AXES)]
             assert not any(during[0x1440 + 0x40 * k] >> 31 for k in range(AXES - 1))
         assert cob_ids(bus) == before
-
-
-@pytest.mark.every(3)
-@pytest.mark.parametrize(
-    ("nodes", "more", "says"),
-    [
-        ((1,), (4,), r"node 1 has 6 axes, .* nodes 2 to 6, and node 4 is there: give the nodes other IDs"),
-        ((1, 3), (), r"node 1 has 6 axes, .* nodes 2 to 6, and node 3 is there"),
-        ((125,), (), r"node 125 has 6 axes, .* nodes 126 to 130: the highest node-ID is 127; give the nodes other IDs"),
-    ],
-)
-def test_identifiers_that_somebody_has_are_not_borrowed(nodes, more, says):
-    with (
-        served(nodes, more) as (_, bus),
-        CanDrives(MODULE.name, bus=bus, nodes=nodes, pace="lockstep", safety=False) as drives,
-        pytest.raises(BusError, match=says),
-    ):
-        drives.record(SAMPLED, 0.01)
 
 
 def test_a_dry_run_shows_whom_it_would_ask():

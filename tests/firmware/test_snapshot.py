@@ -310,34 +310,6 @@ def test_a_change_that_the_drives_keep_is_undone_for_good(tmp_path, monkeypatch)
         assert [gains(machine).tolist() for machine in machines] == before
 
 
-def test_an_enabled_axis_is_left_alone(tmp_path, monkeypatch):
-    monkeypatch.setenv("DRIVE_ENV_TIMEOUT", "20")
-    with served() as (channel, machines):
-        with opened(channel) as target:
-            path = take(target).save(tmp_path / "before.toml")
-        machines[0].write(CURRENT_LIMIT, 1234)
-        for word in (0x06, 0x07, 0x0F):
-            machines[0].write(0x6040, word)
-        done = drive_tune("undo", path, "--yes")
-        assert done.exit_code == 1
-        assert "disable it first" in done.stderr
-        assert machines[0].read(CURRENT_LIMIT) == [1234]
-
-
-def test_a_run_that_is_killed_between_its_store_and_its_end_is_undone_for_good(tmp_path, monkeypatch):
-    monkeypatch.setenv("DRIVE_ENV_TIMEOUT", "20")
-    with served() as (channel, machines):
-        before = [gains(machine).tolist() for machine in machines]
-        with opened(channel) as target:
-            transaction = Transaction(target, tmp_path / "before.toml").__enter__()  # and no exit
-            write_gains(target.drives, np.repeat(TRIED, 2, axis=0))
-            assert transaction.store()
-        assert drive_tune("undo", transaction.path, "--yes").exit_code == 0
-        with opened(channel) as target:
-            target.drives.reset_node()
-        assert [gains(machine).tolist() for machine in machines] == before
-
-
 def test_what_drives_were_told_to_keep_is_taken_back_for_good(tmp_path, monkeypatch):
     monkeypatch.setenv("DRIVE_ENV_TIMEOUT", "20")
     with served() as (channel, machines), opened(channel) as target:

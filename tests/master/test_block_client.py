@@ -15,13 +15,13 @@ from drive_env.bus.world import World
 from drive_env.canopen.frames import Frame
 from drive_env.canopen.node import Node
 from drive_env.dictionary.aborts import ObjectAccessError
-from drive_env.fieldbus.errors import BusError, NoAnswerError
+from drive_env.fieldbus.errors import BusError
 from drive_env.master.can.block_transfer import BLOCK_FROM
 from drive_env.master.can.port import Port
 from drive_env.master.can.sdo import SdoClient
 
 DEVICE = str(TESTS / "all_services.toml")
-TEXT, DATA = 0x2F00, 0x2F01
+DATA = 0x2F01
 UPLOAD, DOWNLOAD = 5, 6  # client command specifiers of blocks
 
 
@@ -116,17 +116,6 @@ def test_an_upload_that_loses_frames_arrives(port, lost):
     assert port.answered > 200 + 3
 
 
-def test_a_changed_segment_is_found_by_the_checksum(port, monkeypatch):
-    content = bytes(1400)
-    port.node.dictionary.port(DATA, 0).write_text(content.decode("latin-1"))
-    take = port._take
-    monkeypatch.setattr(port.node, "_send", lambda f: take(f._replace(data=b"\x07abcdefg") if f.data[0] == 7 else f))
-    with pytest.raises(BusError, match="checksum of 1400 bytes is wrong"):
-        read(client_of(port))
-    assert port.sent[-1][0] == 0x80
-    assert port.sent[-1][4:] == bytes.fromhex("04000405")
-
-
 def test_a_server_without_blocks_is_asked_once(tmp_path):
     text = Path(DEVICE).read_text().replace("block_size = 127", "")
     (tmp_path / "device.toml").write_text(text)
@@ -137,28 +126,6 @@ def test_a_server_without_blocks_is_asked_once(tmp_path):
             write(client, content)
             assert read(client) == content
         assert port.blocks() == [DOWNLOAD]
-
-
-def test_a_server_that_does_not_answer_a_block_request_is_asked_once(port):
-    client, content = client_of(port), random.Random(6).randbytes(400)
-    port.lost = {1}
-    write(client, content)
-    assert read(client) == content
-    assert port.blocks() == [DOWNLOAD]
-
-
-def test_what_the_node_refuses_is_refused(port):
-    with pytest.raises(ObjectAccessError, match="more than the drive has memory for") as caught:
-        write(client_of(port), bytes(5000))
-    assert caught.value.abort_code == 0x0504_0005
-
-
-def test_a_node_that_falls_silent_ends_the_transfer(port):
-    content = bytes(1400)
-    port.node.dictionary.port(DATA, 0).write_text(content.decode("latin-1"))
-    port.lost_answers = set(range(20, 10_000))
-    with pytest.raises(NoAnswerError, match="did not answer"):
-        read(client_of(port))
 
 
 @pytest.mark.parametrize("frame", [3, 50, 128])
@@ -225,15 +192,3 @@ def test_the_eds_over_a_bus(drives, lockstep, bit_rate):
         segments = len(content) / 7
         assert world.time - begun > segments * max(node._device.canopen.sdo_time, 111 / bit_rate)
         assert world.time - begun < segments * max(node._device.canopen.sdo_time, 135 / bit_rate) * 1.3
-
-
-def test_a_download_over_a_bus_in_real_time(drives):
-    drives.machine.reset()
-    world = World(lockstep=False)
-    world.add(drives, (5,))
-    world.power_on()
-    content = random.Random(8).randbytes(4000)
-    client = SdoClient(WorldPort(world), 5)
-    client.write(DATA, 0, content, "data", 5.0)
-    assert client.read(DATA, 0, "data", 5.0) == content
-    assert world.wire.statistics.lost == 0

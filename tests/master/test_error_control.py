@@ -393,10 +393,6 @@ def test_life_guarding_takes_both_its_objects(listed):
     assert not objects.log
 
 
-def test_node_ids_of_masters_are_the_last_32():
-    assert (MASTERS[0], MASTERS[-1], len(MASTERS)) == (96, 127, 32)
-
-
 def test_a_consumer_s_sub_index_0_is_none():
     control, objects, _, _ = control_of({(0x1016, 0): b"\1", CONSUMER: bytes(4)})
     control.configure(0.5)

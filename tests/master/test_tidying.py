@@ -69,19 +69,6 @@ def test_heartbeats_go_on_until_the_drive_no_longer_waits_for_them(drive, bus):
     assert alive == [True]
 
 
-@pytest.mark.parametrize("key", [CONSUMER, FIRST_TPDO, (0x1A00, 2)])
-def test_what_a_drive_refuses_is_told_and_the_rest_is_put_back(drive, bus, caplog, key):
-    before = settings(drive)
-    drives = used(bus)
-    drive.refusals[key] = 0x08000022
-    drives.close()
-    after = settings(drive)
-    pdo = {key[0], key[0] + 0x200, key[0] - 0x200} if key != CONSUMER else {key[0]}
-    assert {name[0] for name in before if after[name] != before[name]} <= pdo
-    (line,) = [record.getMessage() for record in caplog.records]
-    assert "refused the write of" in line and "\n" not in line
-
-
 def test_a_node_that_was_stopped_is_woken_to_be_put_back(drive, bus, caplog):
     """In the NMT state stopped no SDO is answered (CiA 301, 7.3.2.2.4): a node gets there when it misses heartbeats."""
     before = settings(drive)

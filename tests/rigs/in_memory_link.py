@@ -1,16 +1,14 @@
 """A fieldbus that is none: a link which calls the nodes of emulated drives, and no CAN frame anywhere.
 
-It is as little like CAN as a link can be: nodes have states of their own and a mailbox for their objects, all process
-data of a node are one packed image of each direction, and a node that gets none for as long as its process-data
-watchdog says stops its axes. In lockstep a cycle lets time pass, otherwise a thread does by the clock.
+It is as little like CAN as a link can be: nodes have states of their own and a mailbox for their objects, and all
+process data of a node are one packed image of each direction. A cycle lets time pass: no master dies on it, no frame is
+lost, and nodes restart by command alone. What a link does where they are is tests/ethercat's.
 """
 
 from __future__ import annotations
 
 import contextlib
 import math
-import threading
-import time
 from collections import deque
 from enum import Enum
 
@@ -19,40 +17,34 @@ import numpy as np
 from drive_env.dictionary.aborts import CANNOT_BE_MAPPED, PDO_LENGTH_EXCEEDED, ObjectAccessError
 from drive_env.dictionary.access import check_readable, check_writable
 from drive_env.fieldbus.description import describe
-from drive_env.fieldbus.errors import BusError, NoAnswerError, refused
-from drive_env.fieldbus.link import NoWatchdogError, ReceivedEmergency, Wording
-from drive_env.master.bus_drives import BusDrives, checked_limits
+from drive_env.fieldbus.errors import NoAnswerError, refused
+from drive_env.fieldbus.link import ReceivedEmergency, Wording
+from drive_env.master.bus_drives import BusDrives
 from drive_env.master.changed_objects import ChangedObjects
-from drive_env.master.pace import LockstepPace, RealTimePace
+from drive_env.master.pace import LockstepPace
 from drive_env.master.packing import Member, pack_rows, unpack_rows
 from drive_env.node.axis import Axis
 from drive_env.node.process_data import MappedObjects
 
 CYCLE = 0.001  # s
 IMAGE = 24  # bytes of an axis' image of either direction
-MOST_BEHIND = 0.01  # s
-WATCHDOG_STEP = 0.04  # s in which a node counts
 FIRST_ADDRESS = 1001
 
-State = Enum("State", "PREOP SAFEOP OP")  # in which a node has a mailbox; and inputs; and outputs, too
+State = Enum("State", "PREOP OP")  # in which a node has a mailbox; and images, too
 
 
 class MemoryNode:
-    """One emulated device: its mailbox, its images, its watchdog."""
+    """One emulated device: its mailbox and its images."""
 
     def __init__(self, drives, first_axis):
         self.device = drives.device
         self.state = State.PREOP
-        self.watchdog = 0.0  # s; 0 watches nobody
         self.emergencies = deque()
-        self.is_listening = True
-        self.exchanged_at = self.lost_at = 0  # cycles at the last image, and when the master was found silent
         self._drives = drives
         self._mine = np.zeros(drives.num_axes, bool)
         self._mine[first_axis : first_axis + self.device.num_axes] = True
         self._entries = self.device.new_dictionary()
         self._axes = [Axis(drives.inside.objects, first_axis + k) for k in range(self.device.num_axes)]
-        self._silent = 0.0
         self._outputs, self._inputs = MappedObjects([]), MappedObjects([])
 
     def port(self, index, sub):
@@ -74,31 +66,18 @@ class MemoryNode:
         port.check(raw)
         port.write(raw)
 
-    def enter(self, state):
-        self.state, self._silent = state, 0.0
-
     def configure(self, outputs, inputs):
         """Take what its images hold, as (index, sub) of each object."""
         assert self.state is State.PREOP, "images are not changed while they are exchanged"
         self._outputs, self._inputs = (MappedObjects([self.port(*key) for key in keys]) for keys in (outputs, inputs))
 
-    def exchange(self, outputs, cycles):
+    def exchange(self, outputs):
         """Take an image, None for none, and return the other; None in a state without process data."""
         if self.state is not State.OP:
             return None
-        self._silent, self.exchanged_at = 0.0, cycles
         if outputs is not None:
             self._outputs.write(outputs)
         return self._inputs.pack()
-
-    def before_cycle(self, cycles):
-        """Notice a master that is silent, before the cycle that would be one too many."""
-        self._silent += CYCLE
-        if self.state is State.OP and self.watchdog and self._silent > self.watchdog:
-            self.enter(State.SAFEOP)
-            self.lost_at = cycles
-            for axis in self._axes:
-                axis.trip()
 
     def after_cycle(self):
         for k, axis in enumerate(self._axes):
@@ -107,57 +86,22 @@ class MemoryNode:
                 self.emergencies.append((row.code, queued.error_register, tuple(row.extra)))
 
     def restart(self):
-        self.enter(State.PREOP)
-        self.watchdog = 0.0
+        self.state = State.PREOP
         self.configure((), ())
         self._drives.reset_node(self._mine)
 
 
 class MemoryBus:
-    """Nodes, and their time: that of cycles in lockstep, else that of the clock, in a thread of `run`."""
+    """Nodes, and their time, which passes by cycles."""
 
-    def __init__(self, drives, lockstep=True):
-        per_node = drives.device.num_axes
+    def __init__(self, drives):
         self.drives = drives
-        self.lockstep = lockstep
-        self.nodes = [MemoryNode(drives, first) for first in range(0, drives.num_axes, per_node)]
-        self.is_connected = True  # the cable
-        self.cycles = 0
-        self.turn = threading.RLock()
-        self._is_over = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
+        self.nodes = [MemoryNode(drives, first) for first in range(0, drives.num_axes, drives.device.num_axes)]
 
     def cycle(self):
-        with self.turn:
-            for node in self.nodes:
-                node.before_cycle(self.cycles)
-            self.drives.advance(CYCLE)
-            self.cycles += 1
-            for node in self.nodes:
-                node.after_cycle()
-
-    def let_pass(self, until, patience=60.0):
-        """Return when `until()`, or so much later [s] on a computer that is busy otherwise."""
-        deadline = time.monotonic() + patience
-        while not until() and time.monotonic() < deadline:
-            time.sleep(CYCLE)
-        assert until()
-
-    def _run(self):
-        due = time.perf_counter()
-        while not self._is_over.wait(max(due - time.perf_counter(), 0.0)):
-            self.cycle()
-            due = max(due + CYCLE, time.perf_counter() - MOST_BEHIND)  # a computer busy otherwise does not catch up
-
-    def __enter__(self):
-        if not self.lockstep:
-            self._thread.start()
-        return self
-
-    def __exit__(self, *error):
-        self._is_over.set()
-        if not self.lockstep:
-            self._thread.join()
+        self.drives.advance(CYCLE)
+        for node in self.nodes:
+            node.after_cycle()
 
 
 class Mailbox:
@@ -167,34 +111,27 @@ class Mailbox:
         self._link, self._k = link, k
 
     def read(self, index, sub, label, timeout):
-        return self._transfer(lambda node: node.upload(index, sub), f"the read of {label}", timeout)
+        return self._transfer(lambda node: node.upload(index, sub), f"the read of {label}")
 
     def write(self, index, sub, data, label, timeout):
-        self._transfer(lambda node: node.download(index, sub, data), f"the write of {label}", timeout)
+        self._transfer(lambda node: node.download(index, sub, data), f"the write of {label}")
 
     put_back = write
 
     def ask(self, index, sub, timeout):
-        try:
+        with contextlib.suppress(ObjectAccessError):
             return self.read(index, sub, "a look", timeout)
-        except (BusError, ObjectAccessError):
-            return None
 
     def command(self, index, sub, data):
-        with contextlib.suppress(NoAnswerError, ObjectAccessError):  # nobody waits for an answer
-            self._transfer(lambda node: node.download(index, sub, data), "a command", 0.0)
+        with contextlib.suppress(ObjectAccessError):  # nobody waits for an answer
+            self._transfer(lambda node: node.download(index, sub, data), "a command")
 
-    def _transfer(self, do, what, timeout):
+    def _transfer(self, do, what):
         self._link.alive()
-        bus, where = self._link.bus, f"node {self._link.nodes[self._k]}"
-        with bus.turn:
-            if bus.is_connected and bus.nodes[self._k].is_listening:
-                try:
-                    return do(bus.nodes[self._k])
-                except ObjectAccessError as error:
-                    raise refused(where, what, error.abort_code) from None
-        time.sleep(timeout)
-        raise NoAnswerError(f"{where} did not answer {what} within {timeout:g} s; check its power")
+        try:
+            return do(self._link.bus.nodes[self._k])
+        except ObjectAccessError as error:
+            raise refused(f"node {self._link.nodes[self._k]}", what, error.abort_code) from None
 
 
 class Images:
@@ -229,12 +166,10 @@ class Images:
         self._played = played or self._played
         if not set(sampled) <= set(self._sampled):
             self._sampled = sampled
-        with self._link.bus.turn:
-            for node in self._link.bus.nodes:
-                before = node.state
-                node.enter(State.PREOP)
-                node.configure(self._keys(self._played), self._keys(self._sampled))
-                node.enter(before)
+        for node in self._link.bus.nodes:
+            before, node.state = node.state, State.PREOP
+            node.configure(self._keys(self._played), self._keys(self._sampled))
+            node.state = before
 
     def sampled_entries(self):
         return self._sampled
@@ -250,9 +185,8 @@ class Images:
         self._played = self._sampled = ()
 
     def restore(self, node):
-        with self._link.bus.turn:
-            self._link.bus.nodes[node].enter(State.PREOP)
-            self._link.bus.nodes[node].configure((), ())
+        self._link.bus.nodes[node].state = State.PREOP
+        self._link.bus.nodes[node].configure((), ())
 
     def _check(self, entries, wrong_way, verb):
         for entry in entries:
@@ -308,33 +242,24 @@ class InputRows:
 
 
 class ImageWatch:
-    """The watch over the master by a node's process-data watchdog, which counts in steps."""
+    """The watch over the master: where time waits for it, no node has to notice that it is gone."""
 
     def __init__(self, link, description):
-        self._link = link
         self._objects = [ChangedObjects(node, link.sdo(k), description) for k, node in enumerate(link.nodes)]
-        self._time = math.inf
         self._is_ours = [False] * len(link.nodes)
-
-    @property
-    def detection_time(self):
-        return self._time
+        self.detection_time = math.inf
 
     def begin(self, silence):
-        self._time = max(math.floor(silence / WATCHDOG_STEP + 1e-6), 1) * WATCHDOG_STEP
-        for k, (node, objects) in enumerate(zip(self._link.bus.nodes, self._objects, strict=True)):
-            if not node.is_listening:
-                raise NoWatchdogError(f"node {self._link.nodes[k]} is not there")
+        self.detection_time = silence
+        for k, objects in enumerate(self._objects):
             objects.quick_stop_on_lost_connection()
-            node.watchdog, self._is_ours[k] = self._time, True
-        self.keep()
+            self._is_ours[k] = True
 
     def keep(self):
-        if math.isfinite(self._time) and time.monotonic() - self._link.exchanged_at > self._time / 3.0:
-            self._link.exchange(is_cycle=False)
+        """Nobody waits for a sign of life."""
 
     def cease(self):
-        self._time = math.inf
+        self.detection_time = math.inf
 
     end = cease
 
@@ -342,14 +267,14 @@ class ImageWatch:
         return self._is_ours[node]
 
     def is_in_force(self, node):
-        return self._link.bus.nodes[node].watchdog == self._time and self._objects[node].are_in_force()
+        return self._objects[node].are_in_force()
 
     def holds(self, key):
         return any(ours and o.holds(key) for ours, o in zip(self._is_ours, self._objects, strict=True))
 
     def restore(self, node):
         self._objects[node].restore()
-        self._link.bus.nodes[node].watchdog, self._is_ours[node] = 0.0, False
+        self._is_ours[node] = False
 
     def forget(self, node):
         self._objects[node].forget()
@@ -375,7 +300,6 @@ class MemoryLink:
         self.wording = Wording("OP", "check the cable", "images")
         self.alive = lambda: None
         self.next_outputs = None
-        self.exchanged_at = -math.inf
         self.takers = []
         self._clients = [Mailbox(self, k) for k in range(len(bus.nodes))]
         self.process = Images(self, description)
@@ -388,39 +312,27 @@ class MemoryLink:
         return self._clients[node]
 
     def wake(self, node):
-        self.bus.nodes[node].is_listening = True
+        """None sleeps."""
 
-    def welcome(self, node):
-        pass
+    welcome = wake
 
     def start(self, nodes=None):
-        with self.bus.turn:
-            for node in self.bus.nodes if nodes is None else [self.bus.nodes[k] for k in nodes]:
-                if self.bus.is_connected:
-                    node.enter(State.OP)
+        for node in self.bus.nodes if nodes is None else [self.bus.nodes[k] for k in nodes]:
+            node.state = State.OP
 
     def reset(self, nodes):
-        with self.bus.turn:
-            for k in nodes:
-                self.bus.nodes[k].restart()
-
-    def lose_power(self, node):
-        """Have a node restart by itself."""
-        self.reset([node])
-        self.restarted(node)
+        for k in nodes:
+            self.bus.nodes[k].restart()
 
     def take_emergencies(self):
-        with self.bus.turn:
-            found = [ReceivedEmergency(address, *one) for address, node in zip(self.nodes, self.bus.nodes, strict=True)
-                     for one in node.emergencies]  # fmt: skip
-            for node in self.bus.nodes:
-                node.emergencies.clear()
+        found = [ReceivedEmergency(address, *one) for address, node in zip(self.nodes, self.bus.nodes, strict=True)
+                 for one in node.emergencies]  # fmt: skip
+        for node in self.bus.nodes:
+            node.emergencies.clear()
         return found
 
     def time_passes(self):
-        before = self.bus.cycles
-        time.sleep(5 * CYCLE)
-        return self.bus.cycles > before
+        return False
 
     def other_masters(self):
         return NoOtherMasters()
@@ -429,34 +341,19 @@ class MemoryLink:
         """Leave it to the transfers."""
 
     def sync(self):
-        self.exchange(is_cycle=True)
-        if self.bus.lockstep:
-            self.bus.cycle()
-
-    def exchange(self, is_cycle):
-        """Exchange images with all nodes; those that come outside a cycle are a sign of life and nobody's samples."""
-        outputs = [None] * len(self.nodes)
-        with self.bus.turn:
-            if is_cycle and self.next_outputs is not None:
-                outputs, self.next_outputs = self.next_outputs, None
-            if not self.bus.is_connected:
-                return
-            self.exchanged_at = time.monotonic()
-            for k, node in enumerate(self.bus.nodes):
-                inputs = node.exchange(outputs[k], self.bus.cycles)
-                if is_cycle and inputs is not None:
-                    for images in self.takers:
-                        images[k].append(inputs)
+        """Exchange images with all nodes, and let a cycle pass."""
+        outputs, self.next_outputs = self.next_outputs or [None] * len(self.nodes), None
+        for k, node in enumerate(self.bus.nodes):
+            inputs = node.exchange(outputs[k])
+            if inputs is not None:
+                for images in self.takers:
+                    images[k].append(inputs)
+        self.bus.cycle()
 
     def receive(self, timeout=0.0):
-        if timeout:
-            time.sleep(timeout)
         return False  # images come with the cycle that asks for them
 
     def wait(self, done, timeout):
-        deadline = time.monotonic() + timeout
-        while not done() and time.monotonic() < deadline:
-            time.sleep(CYCLE)
         return done()
 
     def drain(self):
@@ -469,9 +366,6 @@ class MemoryLink:
 class MemoryDrives(BusDrives):
     """Drives over a `MemoryBus`, as `CanDrives` are over CAN."""
 
-    def __init__(self, bus, *, pace="lockstep", safety=True, timeout=None):
+    def __init__(self, bus, *, safety=True):
         description = describe(bus.drives.device.name, None)
-        description.timeout = timeout
-        checked_limits(safety)
-        paced = LockstepPace() if pace == "lockstep" else RealTimePace(description.cycle)
-        super().__init__(MemoryLink(bus, description), description, paced, safety)
+        super().__init__(MemoryLink(bus, description), description, LockstepPace(), safety)

@@ -152,16 +152,6 @@ def test_what_cannot_be_tuned_gets_its_gains_back_and_the_reason_is_named(five, 
 
 
 @pytest.mark.slow
-def test_a_reversed_encoder_is_seen_and_set_right_and_said(five):
-    target, result, *_ = five
-    right = find_motor("qbl4208").encoder_direction
-    assert result.axes[REVERSED].accepted, result.axes[REVERSED].reason
-    assert target.drives.read(ENCODER_DIRECTION).tolist() == [right] * 5
-    said = f"encoder reversed: 2080h:01 is {right} now, and was {1 - right}"
-    assert [said in axis.notes for axis in result.axes] == [axis == REVERSED for axis in range(5)]
-
-
-@pytest.mark.slow
 def test_the_file_brings_back_what_was(five):
     target, _, before, _, file = five
     restore(target.drives, load_snapshot(file))

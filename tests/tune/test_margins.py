@@ -37,19 +37,6 @@ def test_an_unstable_loop_has_negative_margins():
     assert found.gain_db == pytest.approx(-20.0 * math.log10(2.0), abs=0.02)
 
 
-def test_the_margin_is_the_least_of_all_crossings_and_the_crossover_the_lowest():
-    w = 2.0 * math.pi * 150.0
-    resonance = w**2 / (S**2 + 0.04 * w * S + w**2)
-    L = delayed_integrator(20.0, 0.0) * resonance
-    found = margins(F, L)
-    first = margins(F[F < 60.0], L[F < 60.0])
-    assert found.crossover_hz == first.crossover_hz
-    assert first.phase_deg == pytest.approx(90.0, abs=2.0)
-    # Above the resonance's peak, which is 20 / 150 / 0.04, the phase is near -270.
-    assert found.phase_deg < -45.0
-    assert found.gain_db < 0.0
-
-
 def test_sensitivity_is_one_over_the_distance_from_minus_one():
     L = delayed_integrator(60.0, 1.5e-3)
     assert margins(F, L).ms == pytest.approx((1.0 / np.abs(1.0 + L)).max())
@@ -88,15 +75,6 @@ def test_without_a_crossing_there_is_none():
     assert math.isnan(found.phase_deg)
     assert math.isnan(found.crossover_hz)
     assert found.gain_db == math.inf
-
-
-@pytest.mark.parametrize(
-    ("f", "L", "message"),
-    [([1.0, 2.0], [1.0], "rows of one length"), ([2.0, 1.0], [1.0, 1.0], "increase"), ([0.0, 1.0], [1, 1], "above 0")],
-)
-def test_rows_that_are_none_are_refused(f, L, message):
-    with pytest.raises(ValueError, match=message):
-        margins(f, L)
 
 
 def test_margins_are_read_where_they_are_least_of_several_crossings():
@@ -184,9 +162,12 @@ def test_a_loop_that_passes_minus_180_degrees_with_gain_and_comes_back_is_stable
 
 
 def test_rows_have_one_dimension_and_two_frequencies():
-    for f, L in (([1.0], [1.0]), ([[1.0, 2.0]], [[1.0, 1.0]]), ([1.0, 1.0], [1.0, 1.0])):
-        with pytest.raises(ValueError, match=r"rows of one length|must be above 0 and increase"):
+    for f, L in (([1.0], [1.0]), ([[1.0, 2.0]], [[1.0, 1.0]]), ([1.0, 2.0], [1.0])):
+        with pytest.raises(ValueError, match="rows of one length"):
             margins(f, L)
+    for f in ([1.0, 1.0], [2.0, 1.0], [0.0, 1.0]):
+        with pytest.raises(ValueError, match="must be above 0 and increase"):
+            margins(f, [1.0, 1.0])
     with pytest.raises(ValueError, match="rows of one length"):
         margins([1.0, 2.0], [1.0, 1.0], [True])
 

@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from rigs import ROOT, TESTS
-from rigs.shards import FILES, GRID, PATIENCE, contents, run_command, start_and_wait_for_a_shard
+from rigs.commands import drive_tune
+from rigs.shards import FILES, GRID, PATIENCE, contents
 from rigs.trainings import tiny
-from typer.testing import CliRunner
 
 from agents.evaluation.evaluation import evaluate
 from agents.evaluation.evaluation_shards import Written, evaluate_elsewhere
@@ -31,7 +31,6 @@ from drive_env import motors
 from drive_env.devices import find_device
 from drive_env.motors import find_motor
 from mechanics.loads import MODELS, find_load
-from tuning.commands.cli import app
 from tuning.compare.comparison import compare
 from tuning.compare.suite import load_suite, suite_input
 from tuning.runs import inputs, sweep
@@ -48,7 +47,6 @@ MOTOR = (motors.FOLDER / "qbl4208.toml").read_text(encoding="utf-8")
 RESISTANCE = re.compile(r"(resistance_\w+ = \[)([0-9.]+)")
 INVENTED = TESTS / "invented_drive"
 SMALL = GRID.replace("count = 48", "count = 3")
-OWN = {"device": "invented", "motor": "mine.toml", "load": "arm/arm.xml"}
 
 
 def resistance(text, factor):
@@ -204,12 +202,6 @@ def own_grid(text=SMALL, **names):
     return text
 
 
-def drive_tune(*arguments):
-    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
-    assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
-    return result
-
-
 def begin(out, config):
     """Leave an unfinished run of an experiment with a shard that is done."""
     from tuning.runs import provenance
@@ -301,31 +293,6 @@ def test_settings_of_a_sweep_repeat_it_from_its_folder_alone(own, decoys, monkey
 def write(path, text):
     path.write_text(text, encoding="utf-8")
     return path
-
-
-def test_two_motors_of_one_name_make_two_settings(own):
-    config = write(own / "grid.toml", own_grid())
-    before = load_experiment(config).with_inputs().to_toml({})
-    edit(own / "mine.toml")
-    assert load_experiment(config).with_inputs().to_toml({}) != before
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(sys.platform == "win32", reason="POSIX signals")
-def test_a_killed_sweep_with_a_motor_of_ones_own_is_refused_then_goes_on_to_the_same_bytes(own):
-    config = write(own / "grid.toml", own_grid(GRID.replace("count = 48", "count = 66")))
-    whole = run_command(config, own / "whole")
-    assert whole.returncode == 0, whole.stderr
-    process = start_and_wait_for_a_shard(config, own / "cut")
-    process.kill()
-    process.communicate()
-    edit(own / "mine.toml")
-    refused = run_command(config, own / "cut", "--resume")
-    assert (refused.returncode, "mine.toml (motor) was changed" in refused.stderr) == (2, True), refused.stderr
-    (own / "mine.toml").write_text(MOTOR, encoding="utf-8")
-    done = run_command(config, own / "cut", "--resume")
-    assert done.returncode == 0, done.stderr
-    assert contents(own / "cut") == contents(own / "whole")
 
 
 # --- searches and comparisons -----------------------------------------------------------------------------------------
@@ -501,15 +468,6 @@ def test_a_function_of_a_workers_own_is_not_taken_for_the_one_here(own, decoys, 
     other = written._replace(source="0123456789abcdef" * 4)
     with pytest.raises(ValueError, match=r"my_policy:act: a worker's file with it has hash .*, here it has 0123456789"):
         other.open("tracking", options)
-
-
-def test_worker_processes_open_what_was_sent(own, decoys, monkeypatch):
-    sent = taken("motor", "mine.toml")
-    edit(own / "mine.toml")
-    monkeypatch.chdir(decoys)
-    with open_pool(1) as pool:
-        ((_, motor),) = pool.unordered(find_motor, [sent])
-    assert motor.R_s == find_motor("qbl4208").R_s
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from rigs.commands import drive_tune
 
 from drive_env.drives.raw_gains import read_gains
 from drive_env.emulator.emulated_drives import EmulatedDrives
@@ -17,7 +17,6 @@ from drive_env.loops.sampled import CascadeGains, LoopRates
 from drive_env.loops.true_plant import true_machines
 from drive_env.loops.worst_margins import worst_margins
 from drive_env.trials.score import robust_cost
-from tuning.commands.cli import app
 from tuning.search import optimise as search
 from tuning.search.model_margins import ModelMargins
 from tuning.search.optimise import Settings, TrialRow, objective_values, optimise
@@ -28,10 +27,6 @@ MACHINE = {"device": "tmcm1636", "motor": None, "num_machines": 4}
 FEW = Settings(trials=8, seed=1, dynamics="standard")
 UNKEPT = "89.9/39.9/1.0001"
 IDENTIFIED = 0.1  # of the clearance: what a brief identification may be wrong by
-
-
-def drive_tune(*arguments):
-    return CliRunner().invoke(app, list(map(str, arguments)))
 
 
 @pytest.mark.every(4)

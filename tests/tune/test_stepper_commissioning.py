@@ -9,9 +9,9 @@ import shutil
 import numpy as np
 import pytest
 from rigs.closed_loop_rig import target_of
+from rigs.commands import drive_tune
 from rigs.stepper_rig import BARE, lane
 from rigs.world_bus import on_bus
-from typer.testing import CliRunner
 
 from drive_env import EmulatedDrives, cia402
 from drive_env.devices import find_device
@@ -22,7 +22,6 @@ from drive_env.phase_current import RESERVE, amplitude, holding_torque, run_and_
 from drive_env.trials.load_reading import STALL_ANGLE
 from drive_env.trials.open_loop import encoder_age
 from drive_env.trials.working_moves import WorkingMoves
-from tuning.commands.cli import app
 from tuning.search.optimise import Settings, optimise
 from tuning.search.trial_bench import TrialBench, leave_oscillations_to_trials
 from tuning.stepper import commissioning
@@ -291,25 +290,19 @@ def test_commissioning_finds_the_same_in_process_and_over_the_bus(tmp_path):
 
 
 # --- the command ------------------------------------------------------------------------------------------------------
-def run(*arguments):
-    result = CliRunner().invoke(app, [*map(str, arguments)], env={"COLUMNS": "200"})
-    assert "Traceback" not in result.output
-    return result
-
-
 def test_auto_finds_by_the_gain_set_what_a_device_is(stepper, tmp_path):
     out = tmp_path / "found"
-    result = run("auto", "--device", stepper, "--load", "inertia", "--out", out)
+    result = drive_tune("auto", "--device", stepper, "--load", "inertia", "--out", out)
     assert result.exit_code == 0, result.output
     assert "axis 0: accepted" in result.output and "not measured: current and load step" in result.output
     written = json.loads((out / "stepper-certificate.json").read_text(encoding="utf-8"))
     assert written["axes"][0]["verdict"] == "accepted" and written["load and obstacle tried"]
     assert written["motor"] == NAME, "the device's usual one"
     assert (out / "before.toml").is_file()
-    assert run("verify", out / "stepper-certificate.json").exit_code == 0
+    assert drive_tune("verify", out / "stepper-certificate.json").exit_code == 0
     written["axes"][0]["figures"]["run current [A]"] += 0.1
     (out / "stepper-certificate.json").write_text(json.dumps(written), encoding="utf-8")
-    changed = run("verify", out / "stepper-certificate.json")
+    changed = drive_tune("verify", out / "stepper-certificate.json")
     assert changed.exit_code == 1 and "was changed since it was written" in changed.output
 
 
@@ -319,10 +312,10 @@ def test_a_stepper_of_more_volts_than_its_device_is_tuned_at_those_of_the_device
 
 
 def test_auto_says_what_a_drive_lacks_before_anything_moves(tmp_path):
-    text = run("auto", "--device", BARE, "--motor", "qbl4208").output
+    text = drive_tune("auto", "--device", BARE, "--motor", "qbl4208").output
     assert "turns two-phase hybrid stepper motors" in text
     out = tmp_path / "found"
     device = find_device(BARE)
     assert device.gains.is_open_loop and not find_device("tmcm1636").gains.is_open_loop
-    result = run("auto", "--device", BARE, "--motor", NAME, "--load", "nothing", "--out", out)
+    result = drive_tune("auto", "--device", BARE, "--motor", NAME, "--load", "nothing", "--out", out)
     assert result.exit_code == 2 and not out.exists()

@@ -26,8 +26,6 @@ from mechanics.shaft import one, way
 from tuning.commands.options import TargetOptions, errors_as_exit_codes, open_target, parse_travel
 from tuning.target import (
     FREE,
-    LOCKSTEP_PATIENCE,
-    DriveTime,
     Target,
     address_of,
     emulated,
@@ -79,22 +77,6 @@ def test_a_factory_fresh_drive_turns_the_motor_that_was_named():
     with emulated(motor="ec_i_40", factory_fresh=True) as target:
         assert target.motor.name == target.drives.motor.name == "ec_i_40"
         assert target.drives.read("Maximum Current").tolist() == [0]
-
-
-@pytest.mark.parametrize(("change", "message"), [
-    ({"low": np.array([0.1])}, "axis 0: travel 0.1 to inf rad must contain 0"),
-    ({"high": np.array([-0.1])}, "axis 0: travel -inf to -0.1 rad must contain 0"),
-    ({"low": np.zeros(1), "high": np.zeros(1)}, "must not be empty"),
-    ({"low": np.full(2, -1.0)}, r"low must have shape \(1,\), not \(2,\)"),
-    ({"supply": np.array([0.5])}, r"supply 0.5 V lies outside 8...60 V, with which a tmcm1636 works; give the voltage"),
-    ({"supply": np.array([60.0])}, "supply 60 V lies outside"),
-    ({"supply": np.array([math.nan])}, "supply nan V"),
-    ({"speed": 0.0}, "speed 0 rad/s must be above 0"),
-    ({"current": math.inf}, "current inf A must be above 0 and finite"),
-])  # fmt: skip
-def test_what_cannot_be_is_refused(change, message):
-    with emulated(load="inertia") as target, pytest.raises(ValueError, match=message):
-        replace(target, **change)
 
 
 def test_time_on_the_drives_is_counted_whoever_lets_it_pass():
@@ -433,14 +415,3 @@ def test_the_way_to_the_ends_of_a_load_is_counted_from_where_the_rotor_stands():
 def test_the_axes_of_a_gantry_are_linked():
     target = of_machines(SimpleNamespace(num_axes=4), machines_that_stand_at([0.0] * 4, "gantry"))
     assert (target.axes_per_machine, target.linked) == (2, True)
-
-
-def test_time_that_passes_is_added_up():
-    clock = DriveTime()
-    clock.passes(0.25)
-    clock.passes(0.5)
-    assert clock.seconds == 0.75
-
-
-def test_where_time_waits_an_answer_has_five_seconds():
-    assert LOCKSTEP_PATIENCE == 5.0
