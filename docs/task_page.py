@@ -61,7 +61,9 @@ bus nothing tells the payload.
 # Task -> what the expert has and the agents lack, told while none of them is better.
 LACKS = {
     "TorqueTracking-v1": "the expert knows each machine's inertia and friction, of which an agent sees what the first "
-    "moves of its second show; with nominal parameters the expert has far less than an agent.",
+    "moves of its second show; with nominal parameters the expert has far less than an agent. One with memory is "
+    "better in 64 % of the episodes (95 % interval 52 to 75 %), but machines differ so much that 64 of them do not "
+    "tell their interquartile means apart.",
     "Crane-v1": "the expert knows the rope, of which an agent sees angle and rate of the moment alone. What it is "
     "taught is one answer for all ropes, better than the nominal rope's; exploration adds little, since an action "
     "changes a speed by little and the reward is flat until the load is within some centimetres of its path.",
