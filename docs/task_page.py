@@ -53,20 +53,23 @@ is better than the expert with 95 % confidence, and the Ms of its loops is at mo
 answers following errors by less than it had learnt (`drive-agent margins agent.npz --dynamics standard --out
 calm.npz`), which costs some of its score. Where none ships, take the expert. Of StepperRun none can ship: under a push
 of 1 % of the rated torque the rotor swings in its field with an Ms of 6 in the median of 24 machines, and every sixth
-loses its steps with the expert, every fourth with an agent, since near the highest speed no torque is left.
+loses its steps with the expert, every fourth with an agent, since near the highest speed no torque is left. Of
+KnownPayload none ships: agents win by leaving a fifth of the margins for less lag while an axis moves fast, and over a
+bus nothing tells the payload.
 
 """
 # Task -> what the expert has and the agents lack, told while none of them is better.
 LACKS = {
     "TorqueTracking-v1": "the expert knows each machine's inertia and friction, of which an agent sees what the first "
-    "moves of its second show; with nominal parameters the expert has far less than an agent.",
+    "moves of its second show; with nominal parameters the expert has far less than an agent. One with memory is "
+    "better in 64 % of the episodes (95 % interval 52 to 75 %), but machines differ so much that 64 of them do not "
+    "tell their interquartile means apart.",
     "Crane-v1": "the expert knows the rope, of which an agent sees angle and rate of the moment alone. What it is "
     "taught is one answer for all ropes, better than the nominal rope's; exploration adds little, since an action "
     "changes a speed by little and the reward is flat until the load is within some centimetres of its path.",
     "PoleBalance-v1": "as Crane-v1, of the pole's length.",
     "PoleSwingUp-v1": "as PoleBalance-v1.",
     "PayloadScheduling-v1": "the expert knows the payload, which an agent sees in currents and errors alone.",
-    "KnownPayload-v1": "the expert's schedule is near the least lag that the margins allow.",
     "ServoTuning-v1": "the expert computes the margins of each machine's true model; an agent has ten trials of it, "
     "the first ones of which count, too.",
     "AmplifierTuning-v1": "as ServoTuning-v1; a trial takes some ten milliseconds, so that few are made in the time of "
