@@ -19,12 +19,12 @@ HIDDEN = {"learned": [1.0, 2.0, 3.0, 8.0, 5.0], "tpe": [2.0, 2.5, 2.0, 4.0, 6.0]
 
 def comparison(table):
     def row(tuner, k, hidden):
-        figures = (hidden, hidden, 2.0, hidden / 2.0, 0.1, 46.0, 9.0, 1.9, True, True)
+        figures = (hidden, hidden, 2.0, hidden / 2.0, 0.1, 46.0, 9.0, 1.9, True, True, False)
         return MachineRow(tuner, f"machine {k}", *figures, 1.0, 3, 0, 0, "", False, {"torque_p": 1}, "")
 
     rows = tuple(row(name, k, hidden) for name, values in table.items() for k, hidden in enumerate(values))
     tuners = tuple(
-        TunerRow(name, len(values), 1.0, 1.0, 1.0, 1.0, *(None,) * 5, 1.0, 1.0, 3.0, 0, 0, 0)
+        TunerRow(name, len(values), 1.0, 1.0, 1.0, 1.0, *(None,) * 5, 1.0, 0.0, 1.0, 3.0, 0, 0, 0)
         for name, values in table.items()
     )
     return Comparison(rows, tuners)
