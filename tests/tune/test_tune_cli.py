@@ -240,8 +240,8 @@ def test_the_picture_of_a_comparison_names_its_colour_and_has_what_keeps_the_con
     figures = []
     monkeypatch.setattr(Figure, "savefig", lambda figure, path, **options: figures.append(figure))
     rows = [
-        MachineRow(tuner, f"machine {k}", J, J, 1.0, J, slack, 46.0, 9.0, 1.9, True, True, False, 2.0, 3, 0, 0, "", False,
-                   {"torque_p": 1}, "")
+        MachineRow(tuner, f"machine {k}", J, J, 1.0, J, slack, 46.0, 9.0, 1.9, True, True, False, 2.0, 3, 0, 0, "",
+                   False, {"torque_p": 1}, "")
         for tuner, relative, slack in (("auto", (1.1, 1.2, 1.3), 0.1), ("modulus", (0.9, 1.0, 1.4), -0.1))
         for k, J in enumerate(relative)
     ]  # fmt: skip
