@@ -15,6 +15,7 @@ from drive_env.drives.raw_gains import write_gains
 from drive_env.loops.dynamics import find_dynamics
 from drive_env.loops.linear_model import OPEN_LOOPS
 from drive_env.loops.margins import Margins, margins
+from drive_env.trials.oscillation import OSCILLATION
 from tuning.auto import loop_margins as auto_margins
 from tuning.auto.bench import AutoBench, Journal
 from tuning.auto.loop_model import loop_models
@@ -69,6 +70,20 @@ def test_a_response_of_less_inertia_than_moves_showed_is_that_of_the_play_of_a_g
     why = "the response shows 59 % of the inertia that moves showed, and 60 % are needed"
     assert (after.unseen[0] == "") == seen == np.isfinite(after.slack[0])
     assert seen or after.unseen[0].startswith(why)
+
+
+def test_gains_with_which_the_axis_oscillates_while_it_is_measured_fail(monkeypatch):
+    """A drawn axis was accepted with reservations, and hummed at 243 Hz whenever it turned."""
+    with emulated(load="inertia", num_threads=1) as target, timed(target) as (watched, clock):
+        write_gains(target.drives, GAINS[None])
+        response = replace(frequency_response.measure(target), oscillation=np.array([243.0]))
+        bench = AutoBench(watched, clock, 60.0, find_dynamics("standard"))
+        bench.ground = SimpleNamespace(move=SimpleNamespace(distance=np.array([16384])), begin_here=lambda where: None)
+        monkeypatch.setattr(frequency_response, "measure", lambda *given, **options: response)
+        found = basis(GAINS[None], plant=true_plant(target.drives), found=Identification({}, 0.0))
+        after = auto_margins.measure(bench, found, recorded(GAINS[None]), np.ones(1, bool))
+    assert after.failed[0] == "its loop oscillates by itself at 243 Hz while the axis turns"
+    assert after.swing[0] == OSCILLATION, "so that the next design has less velocity P"
 
 
 # --- both loops, by a measured velocity loop --------------------------------------------------------------------------

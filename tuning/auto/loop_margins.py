@@ -15,6 +15,7 @@ from drive_env.drives.raw_gains import write_gains
 from drive_env.fieldbus.errors import BusError
 from drive_env.loops.dynamics import OFF_NOMINAL, find_dynamics
 from drive_env.safety.envelope import SafetyError
+from drive_env.trials.oscillation import OSCILLATION
 from mechanics.arrays import Integers, Mask
 from tuning.auto.bench import BY_TRIAL
 from tuning.auto.loop_model import LinkedAxis, LoopModel, loop_models, measured_response, one_plant
@@ -48,7 +49,10 @@ FREE_WINDOW = 100  # turns; the following error is meaningless during a frequenc
 
 
 def measure(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mask) -> RecordedGains:
-    """Measure the velocity loop's response of axes with their gains, and the slack of their loops to the dynamics."""
+    """Measure the velocity loop's response of axes with their gains, and the slack of their loops to the dynamics.
+
+    Gains with which an axis oscillates by itself meanwhile fail.
+    """
     going = where & bench.going & (recorded.failed == "")
     if bench.target.linked:
         return _with_slack(bench, basis, recorded, going)
@@ -83,6 +87,7 @@ def measure(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mask
     finally:
         bench.watch_following(going)
     bench.ground.begin_here(going)
+    recorded = _without_oscillating(recorded, response, going)
     unseen, faults = recorded.unseen.copy(), bench.faults()
     for k in map(int, np.flatnonzero(going)):
         seen = _seen(response, k)
@@ -103,6 +108,14 @@ def measure(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mask
     recorded = _with_slack(bench, basis, replace(recorded, response=response, unseen=unseen), going)
     bench.recover_faults(faults, "its frequency response was measured")
     return recorded
+
+
+def _without_oscillating(recorded: RecordedGains, response: MeasuredLoop, where: Mask) -> RecordedGains:
+    """Reject gains with which an axis oscillates by itself, as one that is stopped in a trial."""
+    failed = recorded.failed.copy()
+    for k in map(int, np.flatnonzero(where & (response.oscillation > 0.0))):
+        failed[k] = f"its loop oscillates by itself at {response.oscillation[k]:.0f} Hz while the axis turns"
+    return replace(recorded, failed=failed, swing=np.where(failed != recorded.failed, OSCILLATION, recorded.swing))
 
 
 def _with_slack(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mask) -> RecordedGains:
@@ -137,7 +150,7 @@ def _unclear(bench: AutoBench, basis: Basis, recorded: RecordedGains, response: 
     """Return the axes with too few coherent lines and enough drive time for a longer measurement, (num_axes,)."""
     left = bench.affordable(LONGER * bench.response_time + bench.response_time)
     unclear = np.zeros(bench.target.num_axes, bool)
-    for k in map(int, np.flatnonzero(going & left)):
+    for k in map(int, np.flatnonzero(going & left & (response.oscillation == 0.0))):
         unclear[k] = _seen(response, k) < LEAST_LINES
         if not unclear[k]:
             measured = MeasuredAxis(response, k, basis.identified.known(k)[0])

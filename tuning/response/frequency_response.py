@@ -231,11 +231,11 @@ class _Measurement:
         causes = stop_causes(counted.drives) if stopped.any() else []
         for axis in np.flatnonzero(stopped):
             self._notes[axis].append(f"the drive stopped during the measurement: {causes[axis]}")
-        oscillates = self._note_oscillation(seen, where & seen.enabled)
-        self._note_limits(seen.peak_current, where & ~oscillates)
-        result = self._evaluate(seen, less, where & seen.enabled & ~oscillates)
+        oscillation = self._note_oscillation(seen, where & seen.enabled)
+        self._note_limits(seen.peak_current, where & (oscillation == 0.0))
+        result = self._evaluate(seen, less, where & seen.enabled & (oscillation == 0.0))
         progress(1.0)
-        return result
+        return replace(result, oscillation=oscillation)
 
     # --- amplitudes -----------------------------------------------------------------------------------------------
     def _current_limit(self) -> Floats:
@@ -356,8 +356,8 @@ class _Measurement:
         plant = Plant.from_data_sheet(self._device, motor, motor.voltage, motor.inertia)
         return velocity_noise(self._device, plant)
 
-    def _note_oscillation(self, seen: Pass, where: Mask) -> Mask:
-        """Return which axes oscillate: parts of their currents do not repeat with the excitation."""
+    def _note_oscillation(self, seen: Pass, where: Mask) -> Floats:
+        """Return the frequency of axes that oscillate [Hz], else 0: their currents do not repeat with the signal."""
         shape = (self._passes, self._periods, self._lines.samples, len(where))
         current = seen.current.reshape(shape)
         own = (current - current.mean(axis=1, keepdims=True)).reshape(self._passes, -1, len(where))
@@ -370,7 +370,7 @@ class _Measurement:
             told = f"the loop oscillates at {frequency[axis]:.0f} Hz, whatever it is shaken with"
             also = ", or late SYNCs make its current swing so"
             self._notes[axis].append(f"{told}{also if self._late else ''}: lower its gains, velocity P first")
-        return np.asarray(found)
+        return np.where(found, frequency, 0.0)
 
     def _note_limits(self, peak: Floats, where: Mask) -> None:
         limit = read_current_limit(self._target.drives)
@@ -412,7 +412,7 @@ class _Measurement:
         speed = np.abs(seen.answer).max(axis=0) if self._loop == "velocity" else np.full(len(where), np.nan)
         return MeasuredLoop(
             self._device, self._loop, f, open_loop, coherence, traced, self._gains, tuple(fits), speed,
-            seen.peak_current, self._drive_time, tuple(tuple(notes) for notes in self._notes),
+            seen.peak_current, self._drive_time, tuple(tuple(notes) for notes in self._notes), np.zeros(len(where)),
         )  # fmt: skip
 
     def _fit(

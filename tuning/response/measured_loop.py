@@ -67,6 +67,7 @@ class MeasuredLoop:
         peak_speed, peak_current: Peaks of the excitation [rad/s], [A], shape (axes,).
         drive_time: Time that passed on the drives [s].
         notes: Notes on each axis, for users.
+        oscillation: Frequency at which an axis oscillates by itself [Hz], 0 if it does not, shape (axes,).
     """
 
     device: Device
@@ -81,6 +82,7 @@ class MeasuredLoop:
     peak_current: Floats
     drive_time: float
     notes: tuple[tuple[str, ...], ...]
+    oscillation: Floats
 
     @property
     def trusted(self) -> Mask:
@@ -197,6 +199,7 @@ class MeasuredLoop:
             peak_current=np.where(where, other.peak_current, self.peak_current),
             drive_time=self.drive_time + other.drive_time,
             notes=tuple(b if m else a for a, b, m in zip(self.notes, other.notes, where, strict=True)),
+            oscillation=np.where(where, other.oscillation, self.oscillation),
         )
 
     def estimates(self, axis: int = 0) -> dict[str, Estimate]:
@@ -228,5 +231,5 @@ def merged(results: Sequence[MeasuredLoop]) -> MeasuredLoop:
     """Join measurements of different axes; each axis was measured in one of them."""
     whole = results[0]
     for other in results[1:]:
-        whole = whole.replaced(other, np.asarray(np.isfinite(other.open_loop).any(axis=0)))
+        whole = whole.replaced(other, np.asarray(np.isfinite(other.open_loop).any(axis=0) | (other.oscillation > 0.0)))
     return whole
