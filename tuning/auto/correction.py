@@ -166,10 +166,8 @@ def correct(
                 # dynamics and their trials differ by less than noise, the corrected ones stay.
                 earlier, later = _cost(bench, best), _cost(bench, recorded)
                 no_better = bench.whole_machines(np.where(later < TRIP, 1.0 + SAME, 1.0) * earlier <= later)
-                # If neither loop could be measured, the gains designed for more margin stay.
-                no_better &= ~bench.whole_machines(
-                    (recorded.failed == "") & np.isnan(best.slack) & np.isnan(recorded.slack)
-                )
+                # After gains that could not be measured those stay that were then designed for more margin.
+                no_better &= ~bench.whole_machines((recorded.failed == "") & np.isnan(best.slack))
                 for k in map(int, np.flatnonzero(changed & no_better)):
                     bench.journals[k].undo(recorded.gains[k], best.gains[k], NO_BETTER)
                 recorded = recorded.mixed(best, changed & no_better)
