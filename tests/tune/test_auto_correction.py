@@ -183,7 +183,7 @@ def test_of_gains_whose_loops_were_never_seen_those_designed_for_more_margin_sta
 
 @pytest.mark.parametrize("later", [np.nan, -0.05])
 def test_after_gains_that_were_never_seen_the_later_design_stays_though_it_costs_no_less(later, monkeypatch):
-    """Also one that is short as measured: of a drawn gear the gains before were kept, unseen, and unstable under load."""
+    """Also one that is short as measured: of a gear the gains before were kept, unseen, and unstable under load."""
     slack = {"slack": lambda p: np.nan if p == 1000 else later}
     found, bench, _ = corrected(monkeypatch, [800] * 6, measured=False, **slack)
     assert bench.asked[0] == "soft" and found.gains.tolist() == [gains_of(800)]
