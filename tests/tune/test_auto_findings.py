@@ -16,6 +16,10 @@ from drive_env.trials.positioning import plan_move
 from drive_env.trials.score import RobustScore
 from tuning.auto.one_button import BUDGET, Method, auto
 from tuning.auto.proving import RESTLESS
+from tuning.compare.comparison import compare
+from tuning.compare.oracle import Oracle
+from tuning.compare.suite import load_suite
+from tuning.compare.tuners import find_tuner
 from tuning.target import emulated
 
 COPIES = 2  # of a machine, each with noise of its own
@@ -57,6 +61,19 @@ def test_a_belt_with_23_times_the_rotors_inertia_is_accepted_whatever_the_noise(
     assert ratio == pytest.approx(23.0, abs=0.5)
     assert result.accepted.all(), [axis.reason for axis in result.axes]
     assert not any("following error" in note for axis in result.axes for note in axis.notes)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("seed", "name", "phase"), [
+    (1902, "seed1902-20-three_mass-qbl4208", 30.0),  # hummed at 243 Hz whenever it turned, accepted with a reservation
+    (1901, "seed1901-21-geared_joint-ec_45_flat", 0.0),  # 0.4 degrees where a load closes its play, and no reservation
+])  # fmt: skip
+def test_what_is_accepted_without_reservations_keeps_its_margins_truly(seed, name, phase):
+    """Judged by the true linear machine, with its gears engaged."""
+    machine = next(one for one in load_suite("public", seed) if one.name == name)
+    (row,) = compare([machine], {"auto": find_tuner("auto")}, oracles={name: Oracle(np.ones(5, int), 1.0, 1.0)}).rows
+    assert row.near or row.reserved or not row.accepted, row
+    assert row.phase_deg >= phase, row
 
 
 @pytest.mark.slow

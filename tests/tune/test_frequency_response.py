@@ -19,7 +19,7 @@ from drive_env.motors import find_motor
 from tuning.response import excitation_run
 from tuning.response.frequency_response import Signal, measure
 from tuning.response.held_samples import seen_by_bus
-from tuning.response.measured_loop import COHERENT
+from tuning.response.measured_loop import COHERENT, merged
 from tuning.response.plant_fit import Seen, fit_plant
 from tuning.target import Target, emulated
 
@@ -437,6 +437,9 @@ def test_a_loop_that_oscillates_is_no_response():
     assert any("the loop oscillates at 2" in note for note in response.notes[0])  # 227 Hz
     assert not any("too weak" in note for note in response.notes[0])
     assert math.isnan(response.margins().phase_deg)
+    first = replace(response, oscillation=np.zeros(1), notes=((),))
+    both = merged([first, response])
+    assert both.oscillation == response.oscillation > 0.0 and both.notes == response.notes, "also of a later axis"
 
 
 @pytest.mark.parametrize(
