@@ -31,6 +31,7 @@ from tuning.identify.identified_axis import NAMES
 from tuning.identify.moved_inertia import moved_inertia
 from tuning.identify.quick_identification import identify_briefly, pushed_inertia
 from tuning.identify.working_state import borrowed
+from tuning.response import frequency_response
 from tuning.target import Target, emulated
 
 GAIN_OBJECTS = find_device("tmcm1636").gains.keys
@@ -453,6 +454,24 @@ def test_a_factory_fresh_drive_is_identified_and_stays_factory_fresh():
 
 
 WILD = np.array([[30000, 30000, 32000, 20000, 30000]])
+
+
+@pytest.mark.slow
+def test_axes_are_back_and_off_while_their_response_is_fitted(monkeypatch):
+    """The fit takes a second, after which an envelope in real time stops an axis that gets no command."""
+    target = emulated(load="two_mass", num_threads=1)
+    begun = target.drives.read(cia402.POSITION_ACTUAL)
+    fit, seen = frequency_response.fit_plant, []
+
+    def fitting(*args):
+        seen.append((target.drives.read(cia402.STATUSWORD), target.drives.read(cia402.POSITION_ACTUAL)))
+        return fit(*args)
+
+    monkeypatch.setattr(frequency_response, "fit_plant", fitting)
+    identify(target)
+    [(status, position)] = seen
+    assert not cia402.matches(status, cia402.OPERATION_ENABLED).any()
+    assert abs(position - begun).max() < 0.3 * target.increments().max()
 
 
 @pytest.mark.slow

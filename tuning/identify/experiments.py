@@ -36,6 +36,7 @@ from tuning.identify.working_state import (
     go_back,
     read_role,
     still_enabled,
+    switch_off,
     working_state,
 )
 from tuning.lateness import is_distorted, late_first, told_lateness
@@ -214,7 +215,6 @@ class Experiments:
     def turn(self, working: Working) -> None:
         """Run the experiments that need torque."""
         working, holding = self.pulse_currents(working)
-        drives = working.target.drives
         self.begin("inertia and friction", 0.3, MECHANICS)
         mechanics, inertia = identify_mechanics(working, holding)
         for k in np.flatnonzero(working.where):
@@ -222,10 +222,15 @@ class Experiments:
         working = self.calm(working)
         self.begin("resonance, delay, filter", 0.7, RESPONSE)
         self.respond(working, inertia)
-        working = self.calm(working)
+        self.finish(self.calm(working))
+
+    def finish(self, working: Working) -> None:
+        """Bring the axes that are still enabled back to their origin, and switch them off."""
+        drives = working.target.drives
         on = working.where & still_enabled(drives.read(cia402.STATUSWORD))
         if on.any():
             go_back(replace(working, where=on), "csv", to=0.0)
+            switch_off(drives, on)
 
     def pulse_currents(self, working: Working) -> tuple[Working, Floats]:
         """Identify the windings; return the axes that did not oscillate, in csv, and their holding currents [A]."""
@@ -295,6 +300,7 @@ class Experiments:
             response = measure(
                 here, "velocity", where=able, signal=Signal(high=HIGHEST), confirmed=True, softened=True,
                 progress=lambda share: self.progress("resonance, delay, filter", 0.7 + 0.29 * share),
+                after_motion=lambda: self.finish(self.calm(working)),
             )  # fmt: skip
         for k in np.flatnonzero(able):
             fit = response.fits[k]

@@ -101,6 +101,7 @@ def measure(
     softened: bool = False,
     periods: int = PERIODS,
     progress: Callable[[float], None] | None = None,
+    after_motion: Callable[[], None] | None = None,
 ) -> MeasuredLoop:
     """Measure a loop's frequency response on its axes; they return to their first positions and states.
 
@@ -118,6 +119,8 @@ def measure(
             so; its drives must be watched (`tuning.oscillation_watch`).
         periods: Number of evaluated periods of every pass: more reduce the noise, and take more time.
         progress: Called with the share that is done.
+        after_motion: Called once the axes are back, before the response is evaluated. That takes about a second, longer
+            than an envelope in real time leaves an axis enabled without a command.
 
     Raises:
         ValueError: For an unknown loop or kind, impossible frequencies, a trace on a bus, or a drive without a linear
@@ -147,7 +150,7 @@ def measure(
     if not (axes & closed).any():
         raise ValueError("a P gain is 0 on every axis and the loop is open: give the drives gains first")
     position = np.arange(target.num_axes) % target.axes_per_machine
-    results = []
+    measurements = []
     holds = target.axes_per_machine > 1 and not target.linked
     with at_rest(target, loop, axes & closed) if holds else nullcontext():
         for k in range(target.axes_per_machine):
@@ -164,8 +167,11 @@ def measure(
 
             free = let_go(target, axes & ~chosen, chosen) if target.linked else nullcontext()
             with free, swinging_allowed(target.drives):
-                results.append(measurement.run(show))
-    whole = merged(results)
+                measurement.excite(show)
+            measurements.append(measurement)
+    if after_motion is not None:
+        after_motion()
+    whole = merged([measurement.evaluate() for measurement in measurements])
     open_loop = "a gain is 0 and the loop is open: give the drive gains first"
     notes = tuple(
         (*own, open_loop) if without else own for own, without in zip(whole.notes, axes & ~closed, strict=True)
@@ -194,9 +200,11 @@ class _Measurement:
         self._device: Device = target.device
         self._notes: list[list[str]] = [[] for _ in range(target.num_axes)]
         self._where = where
+        self._less: Pass | None = None  # with less excitation, if confirmed
         self._stoppable: Floats = np.full(target.num_axes, np.inf)  # greatest speed for a stop by the DC link [rad/s]
 
-    def run(self, progress: Callable[[float], object]) -> MeasuredLoop:
+    def excite(self, progress: Callable[[float], object]) -> None:
+        """Move the axes and keep their samples."""
         target = self._target
         self._gains = read_gains(target.drives)
         where = self._where
@@ -217,25 +225,27 @@ class _Measurement:
                 room = np.abs(room) - speed * _duration(1, self._lines)
                 amplitude, speed = self._amplitude(shaker, rough, trial, room, limit)
                 shaker.fastest = np.minimum(shaker.fastest, RETURN_SHARE * self._stoppable)
-                less = None
                 with shaken(counted.drives, SWING * limit):
-                    seen = shaker.run(amplitude, sign * speed, self._passes, self._periods, traced=self._traced)
+                    self._seen = shaker.run(amplitude, sign * speed, self._passes, self._periods, traced=self._traced)
                     progress(0.5 if self._confirmed else 0.9)
                     if self._confirmed:
-                        less = shaker.run(LESS * amplitude, sign * speed, self._passes, self._periods)
+                        self._less = shaker.run(LESS * amplitude, sign * speed, self._passes, self._periods)
         self._drive_time = clock.seconds + shaker.traced_time
-        stopped = where & ~seen.enabled
+        stopped = where & ~self._seen.enabled
         self._late = told_lateness(counted.drives)
         for axis in np.flatnonzero(where) if self._late else ():
             self._notes[axis].insert(0, self._late)
         causes = stop_causes(counted.drives) if stopped.any() else []
         for axis in np.flatnonzero(stopped):
             self._notes[axis].append(f"the drive stopped during the measurement: {causes[axis]}")
-        oscillation = self._note_oscillation(seen, where & seen.enabled)
-        self._note_limits(seen.peak_current, where & (oscillation == 0.0))
-        result = self._evaluate(seen, less, where & seen.enabled & (oscillation == 0.0))
+        self._oscillation = self._note_oscillation(self._seen, where & self._seen.enabled)
+        self._note_limits(self._seen.peak_current, where & (self._oscillation == 0.0))
         progress(1.0)
-        return replace(result, oscillation=oscillation)
+
+    def evaluate(self) -> MeasuredLoop:
+        """Return the response, computed from the axes' motion."""
+        result = self._evaluate(self._where & self._seen.enabled & (self._oscillation == 0.0))
+        return replace(result, oscillation=self._oscillation)
 
     # --- amplitudes -----------------------------------------------------------------------------------------------
     def _current_limit(self) -> Floats:
@@ -381,7 +391,8 @@ class _Measurement:
             )
 
     # --- evaluation -----------------------------------------------------------------------------------------------
-    def _evaluate(self, seen: Pass, less: Pass | None, where: Mask) -> MeasuredLoop:
+    def _evaluate(self, where: Mask) -> MeasuredLoop:
+        seen, less = self._seen, self._less
         lines = self._lines._replace(f=self._lines.f[self._lines.f <= self._top])
         f = lines.f
         closed, coherence, spread = transfer(seen.set_point, seen.answer, lines)
