@@ -1,9 +1,8 @@
-"""A watch over drives in experiments: an axis that oscillates is switched off within 50 ms.
+"""A watch over drives in experiments: an axis that oscillates is switched off, or gets calm gains, within 50 ms.
 
 Time passes in windows of 25 ms; the currents of each are checked before the next begins. The current of an axis that
 moves quietly hardly changes from one millisecond to the next; that of an axis excited on purpose stays below the
-allowed
-value. A loop that oscillates breaks one of the two rules.
+allowed value. A loop that oscillates breaks one of the two rules.
 """
 
 from __future__ import annotations
@@ -32,25 +31,26 @@ class OscillationError(RuntimeError):
 
 
 class OscillationWatch(Observer):
-    """Switches the voltage of an oscillating axis off, so that it coasts as after a fault.
+    """Switches the voltage of an oscillating axis off, so that it coasts as after a fault, or gives it calm gains.
 
     Args:
         where: Axes under experiment, shape (num_axes,).
         limit: Greatest current commanded to each axis [A], shape (num_axes,).
         noise: RMS of the current samples at rest [A]; smaller changes are not an oscillation.
+        calm: Raw gains for axes that oscillate, shape (num_axes, count); None switches these off.
 
     Attributes:
         limit: As given; it may be lowered later.
-        swung: Axes that oscillated and were switched off, shape (num_axes,).
+        swung: Axes that oscillated and were switched off or calmed, shape (num_axes,).
         frequency: Frequency of each axis' last oscillation [Hz], at most 40 Hz; nan without one, shape (num_axes,).
 
-    Letting time pass raises OscillationError once all axes under experiment have oscillated.
+    Letting time pass raises OscillationError once all axes under experiment are switched off.
     """
 
     objects = (cia402.TORQUE_ACTUAL,)
 
-    def __init__(self, where: Mask, limit: Floats, noise: float = 0.0) -> None:
-        self._where = where
+    def __init__(self, where: Mask, limit: Floats, noise: float = 0.0, calm: Integers | None = None) -> None:
+        self._where, self._calm = where, calm
         self.limit = limit
         self._least = CLEAR * noise
         self._ampere: Floats | float | None = None  # amperes per count of the current
@@ -114,10 +114,13 @@ class OscillationWatch(Observer):
             shaking, allowed = window - window.mean(axis=0), self._shaken
         late = (np.sqrt(np.mean(shaking**2, axis=0)) > np.maximum(allowed, self._least)) & ~self.swung
         if late.any():
-            below.write(cia402.CONTROLWORD, cia402.DISABLE_VOLTAGE, where=late)
+            if self._calm is None:
+                below.write(cia402.CONTROLWORD, cia402.DISABLE_VOLTAGE, where=late)
+            else:
+                write_gains(below, self._calm, late)
             self.swung |= late
             self.frequency = np.where(late, strongest_frequency(window)[0], self.frequency)
-            if self.swung[self._where].all():
+            if self._calm is None and self.swung[self._where].all():
                 raise OscillationError("all axes oscillate, and were switched off")
 
 

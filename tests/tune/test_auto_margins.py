@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -11,7 +12,10 @@ from rigs.auto_stages import basis, recorded
 from rigs.known_machines import true_plant
 
 from drive_env import cia402, motion
-from drive_env.drives.raw_gains import write_gains
+from drive_env.drives.currents import ampere_per_count
+from drive_env.drives.interface import Observer
+from drive_env.drives.observed import ObservedDrives
+from drive_env.drives.raw_gains import read_gains, write_gains
 from drive_env.loops.dynamics import find_dynamics
 from drive_env.loops.linear_model import OPEN_LOOPS
 from drive_env.loops.margins import Margins, margins
@@ -23,6 +27,7 @@ from tuning.auto.measured_margins import MeasuredAxis
 from tuning.auto.stages import IdentifiedAxes
 from tuning.estimate import refused
 from tuning.identify.identified_axis import Identification
+from tuning.identify.working_state import cautious_gains
 from tuning.response import frequency_response
 from tuning.response.measured_loop import AtLeast
 from tuning.response.plant_fit import PlantFit
@@ -72,18 +77,35 @@ def test_a_response_of_less_inertia_than_moves_showed_is_that_of_the_play_of_a_g
     assert seen or after.unseen[0].startswith(why)
 
 
-def test_gains_with_which_the_axis_oscillates_while_it_is_measured_fail(monkeypatch):
+class Currents(Observer):
+    """Keeps the currents of the first axis [A]."""
+
+    objects = (cia402.TORQUE_ACTUAL,)
+
+    def __init__(self, ampere):
+        self.ampere, self.seen = ampere, []
+
+    def passed(self, below, duration, trace, asked, play):
+        self.seen += (trace[cia402.TORQUE_ACTUAL][:, 0] * self.ampere).tolist()
+
+
+def test_gains_with_which_the_axis_oscillates_while_it_is_measured_fail_and_do_not_stay():
     """A drawn axis was accepted with reservations, and hummed at 243 Hz whenever it turned."""
-    with emulated(load="inertia", num_threads=1) as target, timed(target) as (watched, clock):
-        write_gains(target.drives, GAINS[None])
-        response = replace(frequency_response.measure(target), oscillation=np.array([243.0]))
-        bench = AutoBench(watched, clock, 60.0, find_dynamics("standard"))
-        bench.ground = SimpleNamespace(move=SimpleNamespace(distance=np.array([16384])), begin_here=lambda where: None)
-        monkeypatch.setattr(frequency_response, "measure", lambda *given, **options: response)
-        found = basis(GAINS[None], plant=true_plant(target.drives), found=Identification({}, 0.0))
-        after = auto_margins.measure(bench, found, recorded(GAINS[None]), np.ones(1, bool))
-    assert after.failed[0] == "its loop oscillates by itself at 243 Hz while the axis turns"
-    assert after.swing[0] == OSCILLATION, "so that the next design has less velocity P"
+    with emulated(load="two_mass", num_threads=1) as target:
+        wild, calm = np.full((1, 5), 32767), cautious_gains(target, 3.0 * target.motor.inertia)
+        currents = Currents(float(np.ravel(ampere_per_count(target.drives))[0]))
+        with timed(replace(target, drives=ObservedDrives(target.drives, currents))) as (watched, clock):
+            bench = AutoBench(watched, clock, 60.0, find_dynamics("standard"))
+            move = SimpleNamespace(distance=np.array([16384]))
+            bench.ground = SimpleNamespace(move=move, begin_here=lambda where: None)
+            found = basis(calm, plant=true_plant(target.drives), found=Identification({}, 0.0))
+            after = auto_margins.measure(bench, found, recorded(wild), np.ones(1, bool))
+        assert re.fullmatch(r"its loop oscillates by itself at 2\d\d Hz while the axis turns", after.failed[0])
+        assert after.swing[0] == OSCILLATION, "so that the next design has less velocity P"
+        assert read_gains(target.drives).tolist() == calm.tolist()
+    windows = np.array(currents.seen[: len(currents.seen) // 25 * 25]).reshape(-1, 25)
+    swings = windows.std(axis=1) > 0.5 * target.current
+    assert 1 <= swings.sum() <= 17, "the axis is calm within 100 ms after the trial of a third of a second"
 
 
 # --- both loops, by a measured velocity loop --------------------------------------------------------------------------

@@ -11,6 +11,7 @@ import numpy as np
 
 from drive_env import cia402
 from drive_env.dictionary.roles import Role
+from drive_env.drives.observed import ObservedDrives
 from drive_env.drives.raw_gains import write_gains
 from drive_env.fieldbus.errors import BusError
 from drive_env.loops.dynamics import OFF_NOMINAL, find_dynamics
@@ -20,6 +21,7 @@ from mechanics.arrays import Integers, Mask
 from tuning.auto.bench import BY_TRIAL
 from tuning.auto.loop_model import LinkedAxis, LoopModel, loop_models, measured_response, one_plant
 from tuning.auto.measured_margins import LOOPS, MeasuredAxis, at_least_by_model, why_unbounded
+from tuning.oscillation_watch import OscillationWatch
 from tuning.response.measured_loop import merged
 
 if TYPE_CHECKING:
@@ -51,7 +53,8 @@ FREE_WINDOW = 100  # turns; the following error is meaningless during a frequenc
 def measure(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mask) -> RecordedGains:
     """Measure the velocity loop's response of axes with their gains, and the slack of their loops to the dynamics.
 
-    Gains with which an axis oscillates by itself meanwhile fail.
+    Gains with which an axis oscillates by itself meanwhile fail; it gets calm gains once its current swings more than
+    its excitation can make it.
     """
     going = where & bench.going & (recorded.failed == "")
     if bench.target.linked:
@@ -66,7 +69,9 @@ def measure(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mask
     drives = bench.target.drives
     # Trials ended anywhere in the travel: count the remaining travel from there.
     low, high = bench.room()
-    here = replace(bench.target, low=low, high=np.maximum(high, LEAST_WAY))
+    noise = bench.target.device.stage["adc_noise"].high
+    watch = OscillationWatch(going, np.full(len(going), bench.target.current), noise, basis.calm)
+    here = replace(bench.target, drives=ObservedDrives(drives, watch), low=low, high=np.maximum(high, LEAST_WAY))
     write_gains(drives, recorded.gains, going)
     drives.write(cia402.FOLLOWING_WINDOW, FREE_WINDOW * drives.read(Role.POSITION_SCALE), where=going)
     try:

@@ -238,7 +238,11 @@ class _Measurement:
         causes = stop_causes(counted.drives) if stopped.any() else []
         for axis in np.flatnonzero(stopped):
             self._notes[axis].append(f"the drive stopped during the measurement: {causes[axis]}")
-        self._oscillation = self._note_oscillation(self._seen, where & self._seen.enabled)
+        watch = watch_of(counted.drives)
+        swung = where & watch.swung if watch else where & False
+        self._oscillation = self._note_oscillation(self._seen, where & self._seen.enabled & ~swung)
+        if watch:
+            self._oscillation = np.where(swung, watch.frequency, self._oscillation)
         self._note_limits(self._seen.peak_current, where & (self._oscillation == 0.0))
         progress(1.0)
 
@@ -259,7 +263,8 @@ class _Measurement:
         for left in reversed(range(SOFTER + 1)):
             amplitude = self._trial_amplitude(speed, limit)
             try:
-                with shaken(drives, TRIAL_SWING * limit):
+                # Stiff gains take all the current to follow the trial's ramps, soft ones of an identification do not.
+                with shaken(drives, TRIAL_SWING * limit if self._softened else np.full(len(limit), np.inf)):
                     trial = shaker.run(amplitude, sign * speed, 1, 1)
             except OscillationError:
                 if not (self._softened and left):
