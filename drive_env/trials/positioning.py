@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 # In communication cycles: the profile, the end of the window in which it settles, and the trial.
 PROFILE, SETTLED, TRIAL = 60, 150, 250
 QUIET = (PROFILE + SETTLED) // 2  # first cycle of the window for the ripple
+WINDOW = 100  # cycles of a trend
 COUNTED_RAMP = "pps^2"  # unit of ramps in increments per second squared
 WATCH = 25  # cycles between two checks of the current in a trial
 ACCELERATION_SHARE = 0.4  # of the rated torque
@@ -191,16 +192,22 @@ def swing(current: Floats, rated_current: float) -> Floats:
 def resting_swing(current: Floats, rated_current: float) -> Floats:
     """Return the RMS of the current about its trend at the end of a move, over the rated one, (num_axes,).
 
-    The trend is a straight line, so that a slow approach to the target, as of coupled axes that work against each
-    other, does not count.
+    The trend is a straight line in each tenth of a second, so that a slow approach to the target, as of coupled axes
+    that work against each other, does not count, nor an integrator that slowly brings the axis to the next count.
 
     Args:
-        current: Current of a move from its start, before any load step [A], (SETTLED cycles, num_axes).
+        current: Current of a move from its start, before any load step [A], (SETTLED cycles or more, num_axes).
         rated_current: Rated current of the motor, peak i_q [A].
     """
-    late = current[QUIET:SETTLED] - current[QUIET:SETTLED].mean(axis=0)
-    time = np.arange(len(late)) - (len(late) - 1) / 2.0
-    return np.asarray((late - np.outer(time, time @ late) / (time @ time)).std(axis=0) / rated_current)
+    late = current[QUIET:]
+    parts = np.array_split(late, max(round(len(late) / WINDOW), 1))
+    return np.asarray(np.concatenate([_without_trend(part) for part in parts]).std(axis=0) / rated_current)
+
+
+def _without_trend(values: Floats) -> Floats:
+    time = np.arange(len(values)) - (len(values) - 1) / 2.0
+    apart = values - values.mean(axis=0)
+    return np.asarray(apart - np.outer(time, time @ apart) / (time @ time))
 
 
 def wrapped(increments: Floats | Integers) -> Floats:

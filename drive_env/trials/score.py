@@ -228,6 +228,8 @@ class RobustScore(Saved):
         friction: Model of the load's friction, as in EmulatedDrives.
         repeats: Runs of every variant of every machine, whose scores are averaged.
         dynamics: Requirements on the loops.
+        rest: How much longer than until the load step the current at rest is judged [s]: an axis may begin to swing
+            only when its integrator has brought it to the next count.
     """
 
     STATE = ("_drives", "_t_0", "_reference", "_move", "_loops", "_constant")
@@ -243,6 +245,7 @@ class RobustScore(Saved):
         friction: str = "stribeck",
         repeats: int = 1,
         dynamics: str | Dynamics = DEFAULT,
+        rest: float = 0.0,
     ) -> None:
         from drive_env.devices import find_device
         from drive_env.emulator.emulated_drives import EmulatedDrives
@@ -262,7 +265,7 @@ class RobustScore(Saved):
             and (variant.velocity_p == 1.0 or not by_current)
             and (variant.run_current == 1.0 or by_current)
         )
-        self.num_machines, self.repeats = num_machines, repeats
+        self.num_machines, self.repeats, self._rest = num_machines, repeats, rest
         self._runs = repeats * len(self.variants)  # per machine
         # Variants with half the inertia behind a nut or a flank resonate too fast for the physics' step of the nominal
         # machine.
@@ -423,17 +426,26 @@ class RobustScore(Saved):
             start(drives, target)
             before = drives.record(objects, SETTLED * CYCLE)
             free = {name: before[name] for name in objects}
+            later = self._resting() if self._rest and cia402.TORQUE_ACTUAL in objects else None
             loaded = self._load_step(objects)
         failed = failed | ~cia402.matches(loaded[cia402.STATUSWORD][-1], cia402.OPERATION_ENABLED)
         terms = self._terms(free, loaded, target, used)
         terms = terms._replace(tripped=terms.tripped | failed | np.repeat(drives.machine.diverged, shape[2]))
         error = np.abs(wrapped(target - loaded[cia402.POSITION_ACTUAL])).sum(axis=0) * CYCLE / move.increments
         if cia402.TORQUE_ACTUAL in objects:
-            measured = free[cia402.TORQUE_ACTUAL].astype(float) * ampere_per_count(drives)
+            raw = [one[cia402.TORQUE_ACTUAL] for one in (free, later) if one is not None]
+            measured = np.concatenate(raw).astype(float) * ampere_per_count(drives)
             seen = swings(measured, drives.motor.rated_current, shape)
         else:
             seen = CurrentSwings(np.full(shape, np.nan), np.full(shape, np.nan))
         return terms.each(lambda value: value.reshape(shape)), np.maximum(error, move.least_error).reshape(shape), seen
+
+    def _resting(self) -> Mapping[Any, Integers]:
+        """Record the current of a longer rest, after which the machines are as before."""
+        state = self._drives.save_state()
+        trace = self._drives.record([cia402.TORQUE_ACTUAL], self._rest)
+        self._drives.restore_state(state)
+        return {cia402.TORQUE_ACTUAL: trace[cia402.TORQUE_ACTUAL]}
 
     # Overridden for other kinds of drives.
     _cost: Callable[[Any], Floats] = staticmethod(cost)
@@ -516,9 +528,9 @@ def swings(current: Floats, rated_current: float, shape: tuple[int, ...]) -> Cur
     """Return the swings of runs' measured current, in the given shape.
 
     Args:
-        current: Current until the load step [A], (SETTLED cycles, axes of all machines).
+        current: Current until the load step [A], (SETTLED cycles or more, axes of all machines).
         rated_current: Rated current of the motor, peak i_q [A].
         shape: Machines, runs, axes.
     """
-    found = (swing(current, rated_current), resting_swing(current, rated_current))
+    found = (swing(current[:SETTLED], rated_current), resting_swing(current, rated_current))
     return CurrentSwings(*(one.reshape(shape) for one in found))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from functools import partial
 from types import MappingProxyType, SimpleNamespace
 from typing import NamedTuple
@@ -11,10 +12,12 @@ import pytest
 from rigs.chip_gains import Gains, bandwidths_from_gains, chip_gains
 from rigs.known_machines import true_plant
 
-from drive_env import EmulatedDrives
+from drive_env import EmulatedDrives, cia402, motion
 from drive_env.devices import find_device
 from drive_env.devices.gains import BASELINE_RULE, bandwidth_gains, rule_gains, small_time_constants
 from drive_env.dictionary.roles import Role
+from drive_env.drives.currents import ampere_per_count
+from drive_env.drives.raw_gains import write_gains
 from drive_env.emulator.parameters import WIRING
 from drive_env.loops.dynamics import find_dynamics
 from drive_env.loops.true_plant import elastic_lags
@@ -37,6 +40,8 @@ from drive_env.trials.score import (
 )
 from mechanics.loads import find_load
 from mechanics.shaft import one, way
+from tuning.compare.suite import load_suite, open_group
+from tuning.compare.yardstick import Yardstick
 from tuning.target import emulated
 
 DEVICE, MOTOR = find_device("tmcm1636"), MOTORS["qbl4208"]
@@ -363,6 +368,26 @@ def test_variants_are_parallel_machines_with_their_parameters(two_mass):
     assert inertia[0] / inertia[0, 0] == pytest.approx([1, 2, 0.5, 1, 1, 1])
 
 
+def test_a_longer_rest_shows_the_swing_that_begins_after_the_load_step_and_changes_nothing_else():
+    """Between two counts an axis swings once its integrator has brought it there; these gains were once an oracle's."""
+    machine = next(one for one in load_suite("public") if one.name == "inertia-qbl4208-3")
+    gains = np.array([[4314, 2207, 6585, 960, 929]])
+    with closing(Yardstick([machine], 1)) as judge:
+        whole = judge.score(gains)
+        judge._score._rest = 0.0
+        short = judge.score(gains)
+    assert short.slack > 0.0 > whole.slack
+    assert whole.performance == short.performance and (whole.j == short.j).all()
+    with open_group([machine], 1) as target:
+        drives = target.drives
+        write_gains(drives, gains)
+        motion.enable(drives, mode="pp")
+        motion.move_to(drives, np.rint(0.57 * target.increments()).astype(np.int64), relative=True)
+        drives.advance(0.1)
+        current = drives.record([cia402.TORQUE_ACTUAL], 0.5)[cia402.TORQUE_ACTUAL] * ampere_per_count(drives)
+    assert current.std() > RESTING * target.motor.rated_current
+
+
 def test_repeats_are_runs_with_other_noises_and_places_and_a_score_is_their_mean():
     repeated, alone, gains = bench("two_mass", 2, repeats=3), bench("two_mass", 2), times(1.4, 2)
     seeds = repeated._drives.inside.noise_seeds.reshape(2, 3, len(VARIANTS))
@@ -576,7 +601,7 @@ def scored(variants=VARIANTS[:3], repeats=1, **recorded):
     made = StepperScore.__new__(StepperScore)  # which runs as a servo's does, and needs no loops
     made._settling_scale = partial(RobustScore._settling_scale, made)
     made.variants, made.num_machines, made.repeats = variants[: 3 // repeats], 2, repeats
-    made._runs, made._axes = 3, (2, 3, 2)
+    made._runs, made._axes, made._rest = 3, (2, 3, 2), 0.0
     made.dynamics, made._has_loops = find_dynamics("standard"), False
     made._drives = Machines(**recorded)
     made._constant, made._load_torque = np.zeros(6), -0.25

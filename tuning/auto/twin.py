@@ -40,6 +40,7 @@ LEAST_RATIO = 1.03  # of resonance over anti-resonance: with a smaller ratio the
 BREAKAWAY = 1.5  # static over sliding friction, of bearings
 SLOWEST_FILTER = 50.0  # Hz
 UNKNOWN_FILTER = 0.5  # relative: assumed uncertainty of a velocity filter that was not identified
+REST = 0.15  # s that twins rest in addition, to show gains that swing at rest
 
 
 class Known(NamedTuple):
@@ -210,7 +211,7 @@ class Twins:
             axes = np.flatnonzero(mask)
             robust = RobustScore(
                 device.name, load, motor, len(axes) * sets * len(worlds), num_threads=num_threads, repeats=repeats,
-                dynamics=dynamics,
+                dynamics=dynamics, rest=REST,
             )  # fmt: skip
             self._parts.append((axes, robust))
             chosen = [known[int(k)] for k in axes]

@@ -24,6 +24,7 @@ from tuning.identify.moved_inertia import true_inertia
 # Number of runs of every machine and variant, each with its own noise, whose scores are averaged: with one run, the
 # score of the same gains differs by 10 % on some machines.
 REPEATS = 16
+REST = 0.3  # s
 
 
 class Yardstick:
@@ -48,7 +49,15 @@ class Yardstick:
         device, load, motor, friction = group[0].kind
         count = len(group) * copies
         self._score = RobustScore(
-            device, load, motor, count, num_threads=num_threads, friction=friction, repeats=repeats, dynamics=dynamics
+            device,
+            load,
+            motor,
+            count,
+            num_threads=num_threads,
+            friction=friction,
+            repeats=repeats,
+            dynamics=dynamics,
+            rest=REST,
         )
         self.dynamics = self._score.dynamics
         with open_group(group, num_threads) as target:
