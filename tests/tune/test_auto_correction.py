@@ -259,8 +259,13 @@ def test_corrected_gains_that_are_worse_on_the_drive_are_not_kept(monkeypatch):
 @pytest.mark.parametrize(("cost", "left"), [(0.9, 800), (1.03, 800), (1.1, 1000)])
 def test_where_trials_cannot_tell_the_gains_designed_by_what_was_measured_stay(cost, left, monkeypatch):
     """The noise of a trial does not decide between two designs."""
-    found, _, verified = corrected(monkeypatch, [800, 800], slack=lambda p: -0.02 if p == 1000 else 0.1, cost=cost)
+    found, _, verified = corrected(monkeypatch, [800, 800], slack=lambda p: -0.031 if p == 1000 else 0.1, cost=cost)
     assert verified[:2] == [[1000], [800]] and found.gains[0, VELOCITY_P] == left
+
+
+@pytest.mark.parametrize(("short", "verified"), [(0.02, [[1000]]), (0.04, [[1000], [800]])])
+def test_margins_missed_by_less_than_the_certificate_may_be_off_are_not_corrected(short, verified, monkeypatch):
+    assert corrected(monkeypatch, [800, 800], slack=lambda p: -short if p == 1000 else 0.1)[2] == verified
 
 
 @pytest.mark.parametrize(("later", "left"), [(-0.11, 1000), (-0.09, 900)])
