@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from contextlib import contextmanager
+from types import SimpleNamespace
 
 import can
 import numpy as np
@@ -20,8 +21,10 @@ from typer.testing import CliRunner
 
 from agents.tuner import tuning_run
 from drive_env import cia402, motion
+from drive_env.devices import find_device
 from drive_env.fieldbus.description import Description
 from drive_env.master.can.port import Port
+from drive_env.master.parameters import Difference
 from tuning.auto import one_button as auto_module
 from tuning.commands.cli import app as drive_tune
 from tuning.snapshot import SET_POINTS, Transaction, differences
@@ -45,6 +48,15 @@ def target_of(bus):
 
 def undo(file):
     return CliRunner().invoke(drive_tune, ["undo", str(file), "--yes"])
+
+
+@pytest.mark.parametrize(("axes", "told"), [(1, "changed still: 2041h"), (2, "changed still: axis 1: 2041h")])
+def test_a_change_on_one_axis_of_several_names_it(monkeypatch, axes, told):
+    entry = find_device("tmcm1636").new_dictionary().find(GAIN_OBJECTS[0])
+    snapshot = SimpleNamespace(axes=({},) * axes, left_out={})
+    monkeypatch.setattr("tuning.way_back.load_snapshot", lambda file: snapshot)
+    monkeypatch.setattr("tuning.way_back.read_anew", lambda given: [(axes - 1, Difference(entry, 1, 2))])
+    assert what_is_changed("before.toml").startswith(told)
 
 
 # --- the commands -------------------------------------------------------------------------------------------------
