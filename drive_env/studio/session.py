@@ -115,7 +115,7 @@ class Session:
         when_not_opened: Called by the drives' thread in this case.
         presence: The open pages.
         recorder: The recorder of samples.
-        stored: Parameters by axis that the drive is known to have stored: those at the start.
+        stored: Parameters by axis that the drive is known to have stored: those at the start, or when it stored last.
         scopes: The scope of each axis that a page has shown; it waits for its trigger even if no page shows it.
         at_end: Functions that restore changes, called by the drives' thread before the drives are closed, when nothing
             turns.
@@ -354,10 +354,11 @@ class Session:
             self._drives = SharedDrives(
                 self._real, self.recorder, self._look, self._hear, self.presence.moves, self._why_stopped
             )
+            self._drives.when_stored = self._read_stored
             self._states = AxisStates(self._real, self.description, self.workspace.units)
             self._choose_samples()
             self._drives.advance(PIECE)  # emulators are compiled here
-            self._read_stored()
+            self._read_stored(np.ones(self.num_axes, bool))
             self.state = "open"
             while not self._is_closing:
                 job = self._next()
@@ -371,16 +372,21 @@ class Session:
         finally:
             self._end()
 
-    def _read_stored(self) -> None:
-        """Read the parameters of every axis: after a start they are the stored ones."""
+    def _read_stored(self, where: Mask) -> None:
+        """Read the parameters of the nodes of some axes: they are those stored after a start, or a write of 1010h."""
         assert self._drives is not None
         drives = self._drives
-        self.stored = {axis: {} for axis in range(self.num_axes)}
-        for entry in parameters(SingleAxes(drives, self.description)):
+        axes = SingleAxes(drives, self.description)
+        per_node = axes.description.num_axes
+        there = [axis for axis in range(self.num_axes) if where.reshape(-1, per_node)[axis // per_node].any()]
+        found: dict[int, dict[Key, int]] = {axis: {} for axis in there}
+        for entry in parameters(axes):
             key = (entry.index, entry.sub)
             with contextlib.suppress(ObjectAccessError):
-                for axis, value in enumerate(drives.read(key).tolist()):
-                    self.stored[axis][key] = int(value)
+                values = drives.read(key)
+                for axis in there:
+                    found[axis][key] = int(values[axis])
+        self.stored |= found
 
     def _end(self) -> None:
         real = self._real

@@ -52,8 +52,8 @@ def borrowed(device: Device) -> tuple[ObjectName, ...]:
 
 def check_identifiable(device: Device, modes: Iterable[str] = MODES) -> None:
     """Raise ValueError unless a device has the linear model, modes and objects of experiments."""
-    lent = (name for name in borrowed(device) if not isinstance(name, Role))
-    check_measurable(device, modes, (name if isinstance(name, tuple) else (name, 0) for name in lent))
+    numbers = (name for name in borrowed(device) if not isinstance(name, Role | str))
+    check_measurable(device, modes, [(name, 0) if isinstance(name, int) else name for name in numbers])
 
 
 def read_role(target: Target, role: Role) -> Integers:
