@@ -112,6 +112,8 @@ def log(
                         message.channel = None
                     writer(message)
                     count += 1
+                if ending == ".db":
+                    _await_database(file, writer, count)
         finally:
             if taken is not None:
                 signal.signal(signal.SIGINT, taken)
@@ -272,6 +274,14 @@ def _check_new(file: Path, ending: str) -> None:
 def _check_format(file: Path, ending: str) -> None:
     if ending not in FORMATS:
         raise ValueError(f"{file}: the ending gives the format, and {ending!r} is not one of {', '.join(FORMATS)}")
+
+
+def _await_database(file: Path, writer: Any, count: int) -> None:
+    """Wait until a database has its frames: python-can (4.6) would leave out those that still wait for its thread."""
+    while writer.num_frames < count:
+        if not writer._writer_thread.is_alive():
+            raise OSError(f"{file}: {writer.num_frames} of {count} frames were written; is the disk full?")
+        time.sleep(SIGNAL_WAIT)
 
 
 def _is_held(message: Any, ending: str) -> bool:
