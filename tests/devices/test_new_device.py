@@ -932,7 +932,7 @@ def test_eds_and_dcf_have_the_commissioned_values_and_python_canopen_reads_them(
     assert (dcf.node_id, dcf.bitrate, dcf[0x1400][1].value) == (1, 1_000_000, 0x201)
     assert "LastEDS=alpina_ax40.eds" in (tmp_path / "a.dcf").read_text(encoding="utf-8")  # which it was made of
     assert eds_done.stdout.endswith(f"parameters of {folder}\n")
-    assert dcf_done.stdout.endswith(f"parameters of {folder}, as node 1\n")
+    assert dcf_done.stdout.endswith(f"parameters of {folder}, as node 1 at 1000 kbit/s\n")
     printed = run("export", "eds", "-", "--device", folder).stdout  # as the device has it
     assert printed == find_device(str(folder)).eds.read_text(encoding="utf-8")
     assert run("export", "eds", "-", *of_motor).stdout != printed
