@@ -552,14 +552,13 @@ class Session:
 
     def _leave_alone(self, job: Job | None) -> None:
         """Stop and disable all axes, since no page shows an enabled axis."""
-        if not self._is_left:
-            self._is_left = True
-            self.say("warning", "the last page was closed with an axis enabled: the axes were stopped and disabled")
         if job is not None and not job.stopped:
             job.stopped = "the last page was closed"
         self._stop(np.ones(self.num_axes, bool))
         assert self._real is not None
-        self._bring_to_rest(self._real)
+        if self._bring_to_rest(self._real) and not self._is_left:
+            self._is_left = True
+            self.say("warning", "the last page was closed with an axis enabled: the axes were stopped and disabled")
 
     def _stop(self, axes: Mask) -> None:
         """Quick-stop live axes; it bypasses `_look`, which calls it."""
@@ -574,8 +573,8 @@ class Session:
         except Exception as error:  # the bus failed: the drive's watchdog acts
             self.say("error", sentence(error))
 
-    def _bring_to_rest(self, real: Drives) -> None:
-        """Wait until no axis turns, then switch the voltage off."""
+    def _bring_to_rest(self, real: Drives) -> bool:
+        """Wait until no axis turns, then switch the voltage off; return whether it was possible, else say why not."""
         assert self._drives is not None
         try:
             with self._drives.lock:
@@ -586,8 +585,10 @@ class Session:
                     waited += PIECE
                 if live.any():
                     motion.disable(real, where=live)
+            return True
         except Exception as error:
             self.say("error", sentence(error))
+            return False
 
     def _is_any_live(self) -> bool:
         newest = self.recorder.newest().get((cia402.STATUSWORD, 0))

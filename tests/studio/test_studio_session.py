@@ -19,6 +19,7 @@ from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.roles import Role
 from drive_env.drives.limit_at_rest import SHARE
 from drive_env.fieldbus.description import describe
+from drive_env.fieldbus.errors import BusError
 from drive_env.master.parameters import read_parameters
 from drive_env.master.single_axes import SingleAxes
 from drive_env.motors import find_motor
@@ -452,6 +453,7 @@ def test_a_release_that_overtakes_its_jog_wins(session):
 
 
 def test_without_any_page_an_axis_is_stopped_and_disabled(session, monkeypatch):
+    session.presence.beat("page")
     monkeypatch.setattr(presence, "ABANDONED", 0.4)
     with Beats(session):
         session.do(motion_jobs.enable(0, "pv"), "enable").result(10)
@@ -463,6 +465,19 @@ def test_without_any_page_an_axis_is_stopped_and_disabled(session, monkeypatch):
     until(lambda: state_of(session) is State.SWITCH_ON_DISABLED)
     assert speed_of(session) == 0
     assert sum("last page" in event.text for event in session.events) == 1
+
+
+def test_axes_that_could_not_be_stopped_are_not_told_as_stopped(session, monkeypatch):
+    def silent(*_):
+        raise BusError("node 1 does not answer")
+
+    with Beats(session):
+        session.do(motion_jobs.enable(0, "pv"), "enable").result(10)
+        monkeypatch.setattr("drive_env.studio.session._stop_live", silent)
+    monkeypatch.setattr(presence, "ABANDONED", 0.2)
+    until(lambda: any("node 1 does not answer" in event.text for event in session.events))
+    assert not any("were stopped" in event.text for event in session.events)
+    monkeypatch.undo()
 
 
 def test_presence_counts_pages_and_their_motions():
