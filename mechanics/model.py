@@ -35,6 +35,13 @@ CONSTRAINED_PACKING_BOUND = 1e-9
 _MEMORY_PER_COPY = 2048  # bytes; 64 two-mass copies were measured at 194 each
 _MEMORY_PER_CONSTRAINED_COPY = 400_000
 _MEMORY_FIXED = 65536
+MOST_GEAR = 1e9  # rotor's angle per unit of a joint; squared, it must be a number still
+# Numbers of a model that MuJoCo takes although nothing can move by them, and which must not be below 0.
+_FINITE = (
+    "body_mass", "body_inertia", "dof_damping", "dof_frictionloss", "jnt_stiffness", "jnt_range", "qpos0",
+    "qpos_spring", "tendon_damping", "tendon_stiffness", "tendon_frictionloss",
+)  # fmt: skip
+_NOT_BELOW_0 = ("dof_damping", "dof_frictionloss", "tendon_damping", "tendon_frictionloss")
 _MOST_KEPT = 32  # models kept as compiled, each alone
 JOINT_TRANSMISSIONS = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 _REMEDIES = {  # remedies for MuJoCo's messages
@@ -65,6 +72,7 @@ def read_any_model(load: Load) -> mujoco.MjModel:
     kept = _kept.pop(key, None)
     if kept is None:
         kept = _compiled(load, _spec(load)) if ours else _compiled_elsewhere(load, None)
+        _check_numbers(load, kept)
     _kept[key] = kept
     while len(_kept) > _MOST_KEPT:
         _kept.popitem(last=False)
@@ -116,6 +124,15 @@ def resolve(load: Load) -> Load:
     )
 
 
+def _check_numbers(load: Load, model: mujoco.MjModel) -> None:
+    """Raise ValueError for a model with numbers with which its machine would be frozen or would run away by itself."""
+    for name in _FINITE:
+        values = np.ravel(getattr(model, name))
+        if (wrong := values[~np.isfinite(values) | ((name in _NOT_BELOW_0) & (values < 0.0))]).size:
+            least = ", 0 or more" if name in _NOT_BELOW_0 else ""
+            raise ValueError(f"load {load.name!r}: its {name} of the MJCF has {wrong[0]:g}; give finite numbers{least}")
+
+
 def _gears(load: Load, model: mujoco.MjModel, joints: tuple[str, ...]) -> tuple[float, ...]:
     """Return the gear of each axis; ValueError for one that turns nothing, with its place in the file."""
     if isinstance(load.gear, tuple) and len(load.gear) != len(joints):
@@ -128,11 +145,12 @@ def _gears(load: Load, model: mujoco.MjModel, joints: tuple[str, ...]) -> tuple[
         # MuJoCo's gear of an actuator equals ours: the rotor's angle per unit of its joint.
         gears = tuple(actuators_of(model).get(name, 1.0) for name in joints)
     for name, gear in zip(joints, gears, strict=True):
-        if not np.isfinite(gear) or gear == 0.0:
+        if not 1.0 / MOST_GEAR <= abs(gear) <= MOST_GEAR:
             where = "the gear of the actuator of" if of_actuators else "the gear of"
+            why = "" if gear else ", and its rotor would turn nothing"
             raise ValueError(
-                f"load {load.name!r}: {where} {name!r} is {gear:g}, and its rotor would turn nothing; give a finite "
-                "number that is not 0, the rotor's angle per unit of the joint"
+                f"load {load.name!r}: {where} {name!r} is {gear:g}{why}; give the rotor's angle per unit of the joint, "
+                f"of {1.0 / MOST_GEAR:g} to {MOST_GEAR:g} in size"
             )
     return gears
 

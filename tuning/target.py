@@ -17,8 +17,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from drive_env import cia402
+from drive_env.cia402 import Key
 from drive_env.default_device import DEFAULT_DEVICE
 from drive_env.devices.gain_set import LOAD_ANGLE
+from drive_env.devices.gains import check_linear_model
 from drive_env.dictionary.roles import Role
 from drive_env.drives.chosen_axes import ChosenAxes, chosen_parts
 from drive_env.drives.interface import Drives, Observer
@@ -44,6 +46,10 @@ Travel = tuple[float, float]  # signed angles that a rotor may turn from its pre
 AXES = ("apart", "coupled", "linked")
 LOCKSTEP_PATIENCE = 5.0  # s, timeout of answers in lockstep: a late answer means that the computer is busy
 FREE: Travel = (-math.inf, math.inf)
+MEASURED_BY = (
+    (cia402.POSITION_ACTUAL, 0), (cia402.VELOCITY_ACTUAL, 0), (cia402.TORQUE_ACTUAL, 0),
+    (cia402.INTERPOLATION_PERIOD, 1), (cia402.INTERPOLATION_PERIOD, 2),
+)  # fmt: skip
 LONGEST_TRAVEL = 1e9  # rad: far beyond what counters of 32 bits hold
 # How far the envelope lets an axis overshoot its travel: as a share of the travel, with lower and upper limit [rad].
 SLACK, SLACK_ENDS = 0.05, (0.02 * 2.0 * np.pi, 0.5 * 2.0 * np.pi)
@@ -386,6 +392,19 @@ def of_bus(
     lanes = 1 if axes == "apart" else drives.num_axes
     return Target(drives, device, motor, low=low, high=high, axes_per_machine=lanes, linked=axes == "linked",
                   machine=machine, bus=address, **limits)  # fmt: skip
+
+
+def check_measurable(device: Device, modes: Iterable[str], objects: Iterable[Key] = ()) -> None:
+    """Raise ValueError unless a device has a linear model of its loops, modes by their abbreviations, and objects."""
+    check_linear_model(device)
+    own, has = device.allowed_values.get((cia402.MODE, 0)), device.new_dictionary().has
+    lacks = [mode for mode in modes if own is not None and cia402.MODES[mode] not in own]
+    lacks = lacks or [f"{index:04X}h:{sub:02X}" for index, sub in (*MEASURED_BY, *objects) if not has((index, sub))]
+    if lacks:
+        raise ValueError(
+            f"{device.name}: this drive has no {', no '.join(lacks)}, by which its loops are measured; if it has them "
+            "after all, complete its EDS, and 6060:0 in its device.toml; drive-tune sweep needs pv alone"
+        )
 
 
 def check_coupling(axes: str) -> None:

@@ -46,7 +46,8 @@ def what_is_changed(file: Path) -> str:
     """
     with held_signals():  # a second Ctrl-C would suppress the line that matters
         try:
-            found = read_anew(load_snapshot(file))
+            snapshot = load_snapshot(file)
+            found = read_anew(snapshot)
         except (BusError, ObjectAccessError, OSError, RuntimeError, ValueError) as error:
             why = str(error).partition(";")[0]
             return (
@@ -55,7 +56,7 @@ def what_is_changed(file: Path) -> str:
             )
     if not found:
         return f"the drives have their state from before, by a second reading; drive-tune undo {file} restores it"
-    several = len({axis for axis, _ in found}) > 1
+    several = len(snapshot.axes) + len(snapshot.left_out) > 1
     told = [f"{f'axis {axis}: ' if several else ''}{list_differences([one])}" for axis, one in found[:TOLD]]
     more = f" and {len(found) - TOLD} more" if len(found) > TOLD else ""
     return f"changed still: {', '.join(told)}{more}; drive-tune undo {file} restores the state before"

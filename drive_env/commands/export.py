@@ -139,15 +139,16 @@ def _write_commissioned(context: typer.Context, file: Path, drive: CommissionedO
     """
     from drive_env.devices import find_device
     from drive_env.drives.chosen_axes import chosen_parts
-    from drive_env.master.commissioned_eds import CAN_KBIT, commissioned_eds, commissioned_values
+    from drive_env.master.commissioned_eds import CAN_KBIT, commissioned_eds, commissioned_values, own_bit_rate
 
-    axis, eds, device = drive.axis, drive.eds, drive.device
+    axis, eds, device, kbit = drive.axis, drive.eds, drive.device, None
     if names_a_bus(context):
         with drive.connect(eds, safety=False) as drives:
             if axis is not None:
                 chosen_parts([axis], drives.description.num_axes, drives.description.name)
             values = commissioned_values(drives, axis=axis)
             source, whose = drives.description.dictionary.path, drives.description.name
+            kbit = own_bit_rate(drives) if drive.bitrate is None else drive.bitrate // KBIT
     else:
         if eds is not None:
             raise ValueError(
@@ -163,9 +164,8 @@ def _write_commissioned(context: typer.Context, file: Path, drive: CommissionedO
         with EmulatedDrives(device, "inertia", drive.motor, num_machines=known.num_axes, num_threads=1) as emulated:
             values = commissioned_values(emulated, axis=axis)
     name = source.name if str(file) == "-" else file.name
-    kbit = CAN_KBIT if drive.bitrate is None else drive.bitrate // KBIT
-    text = commissioned_eds(source, values, name, node_id=node_id, bit_rate=kbit)
-    node = "" if node_id is None else f", as node {node_id}"
+    text = commissioned_eds(source, values, name, node_id=node_id, bit_rate=kbit or CAN_KBIT)
+    node = "" if node_id is None else f", as node {node_id} at {kbit or CAN_KBIT} kbit/s"
     part = "" if axis is None else f", axis {axis} alone"
     _write(file, text, f"{len(values)} parameters of {whose}{node}{part}")
 

@@ -102,16 +102,15 @@ def log(
                     except (can.CanError, OSError, ValueError) as error:  # ValueError: of a closed socket
                         lost = error
                         break
-                    if message is None:
-                        continue
-                    if not _is_held(message, ending):
-                        left_out += 1
+                    if message is None or not _is_held(message, ending):
+                        left_out += message is not None
                         continue
                     # BLF has two bytes for a channel, which python-can fills with the last digits of its name.
                     if (channel2int(message.channel) or 0) >= MOST_CHANNELS:
                         message.channel = None
                     writer(message)
                     count += 1
+                _await_database(file, writer, count)
         finally:
             if taken is not None:
                 signal.signal(signal.SIGINT, taken)
@@ -272,6 +271,14 @@ def _check_new(file: Path, ending: str) -> None:
 def _check_format(file: Path, ending: str) -> None:
     if ending not in FORMATS:
         raise ValueError(f"{file}: the ending gives the format, and {ending!r} is not one of {', '.join(FORMATS)}")
+
+
+def _await_database(file: Path, writer: Any, count: int) -> None:
+    """Wait until a database has its frames: python-can (4.6) would leave out those that still wait for its thread."""
+    while file.suffix.lower() == ".db" and writer.num_frames < count:
+        if not writer._writer_thread.is_alive():
+            raise OSError(f"{file}: {writer.num_frames} of {count} frames were written; is the disk full?")
+        time.sleep(SIGNAL_WAIT)
 
 
 def _is_held(message: Any, ending: str) -> bool:

@@ -94,7 +94,12 @@ def _frames(file: Path) -> Generator[Any, None, None]:
         return
     with gzip.open(file, "rb") if is_packed else file.open("rb") as content:
         if ending == ".blf":
-            yield from can.BLFReader(content)
+            size = content.seek(0, io.SEEK_END)
+            content.seek(0)
+            reader = can.BLFReader(content)
+            if size < reader.file_size:
+                raise LogError(f"it has {size} of {reader.file_size} bytes, and was cut off")
+            yield from reader
         elif ending in (".pcap", ".pcapng"):
             yield from frames_of_capture(ending, content)
         else:

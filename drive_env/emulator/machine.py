@@ -426,10 +426,12 @@ class Machines:
         return self._axis_field("T_winding"), self._axis_field("T_stage")
 
     def set_temperatures(self, winding: ArrayLike, stage: ArrayLike) -> None:
-        """Set winding and stage temperature [degC], as after previous work."""
-        for name, value in (("T_winding", winding), ("T_stage", stage)):
-            values = np.broadcast_to(np.asarray(value, float), (self.inside.num_axes,))
-            set_lanes(self.inside.records, name, values)
+        """Set winding and stage temperature [degC], as after previous work; ValueError for one that is not finite."""
+        each = {"T_winding": np.asarray(winding, float), "T_stage": np.asarray(stage, float)}
+        if bad := [value for values in each.values() for value in values[~np.isfinite(values)]]:
+            raise ValueError(f"a temperature must be finite, not {bad[0]:g} degC; give a finite number")
+        for name, values in each.items():
+            set_lanes(self.inside.records, name, np.broadcast_to(values, (self.inside.num_axes,)))
 
     def set(self, name: str, value: ArrayLike, where: Mask | None = None) -> None:
         """Set a true parameter [SI] of the machines where the mask is true; bad input changes nothing.
@@ -582,6 +584,6 @@ class Machines:
                 f"{name} takes one value or one for each of {self.inside.num_machines} machines, not shape "
                 f"{values.shape}"
             )
-        if np.any(np.isnan(values)):
-            raise ValueError(f"{name} must be a number, not nan")
+        if not np.isfinite(values).all():
+            raise ValueError(f"{name} must be finite, not {values[~np.isfinite(values)][0]:g}; give a finite number")
         return np.broadcast_to(values, (self.inside.num_machines,)).copy()

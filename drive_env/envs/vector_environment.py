@@ -296,8 +296,8 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
         Raises:
             gymnasium.error.ResetNeeded: Before the first reset, or, with autoreset disabled, while an environment has
                 ended.
-            ValueError: For an action that is not finite, before anything is sent to a drive; actions of ended
-                environments are ignored.
+            ValueError: For an action of another shape or not finite, before anything is sent to a drive; actions of
+                ended environments are ignored.
         """
         if not self._has_begun:
             raise gymnasium.error.ResetNeeded("call reset() before the first step()")
@@ -307,7 +307,7 @@ class VectorEnvironment(VectorEnv[Any, Any, Any], Saved):
                 f"environment {int(np.flatnonzero(before)[0])} has ended and autoreset is disabled; "
                 'call reset(options={"reset_mask": ended})'
             )
-        if not _are_finite(actions):
+        if not _are_finite(actions, self.action_space):
             actions = _finite_actions(actions, before)
         observation, reward, terminated, truncated, info = self._step_rewarded(actions)
         if self._some_ended:
@@ -415,11 +415,11 @@ class SingleEnvironment(gymnasium.Env[Any, Any]):
         return one_of(observation), one_of(info)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, Info]:
-        """Act once; ValueError for an action that is not finite, before anything is sent to the drive."""
+        """Act once; ValueError for an action of another shape or not finite, before anything is sent to the drive."""
         vector = self.vector
         if vector._some_ended or not vector._has_begun:
             raise gymnasium.error.ResetNeeded("the episode has ended or none has begun; call reset()")
-        if not _are_finite(action):
+        if not _are_finite(action, self.action_space):
             _finite_actions(_batch_of_one(action), np.zeros(1, bool))
         # A user's reward needs all environments' arrays; without one there is a faster way.
         stepped = (
@@ -543,12 +543,15 @@ def _rows(tree: Observation, mask: Mask) -> Texts:
     return rows
 
 
-def _are_finite(actions: Any) -> bool:
-    """Return whether all are finite numbers; also False if their sum overflows.
+def _are_finite(actions: Any, space: gymnasium.Space[Any]) -> bool:
+    """Return whether all are finite numbers, also False if their sum overflows; ValueError for another number of them.
 
     A sum in Python takes half the time of NumPy's check of each number.
     """
-    return math.isfinite(sum(np.asarray(actions).ravel().tolist()))
+    values = np.asarray(actions)
+    if values.size != math.prod(space.shape or ()):
+        raise ValueError(f"the action has shape {values.shape}, and {space.shape} is taken; nothing was sent")
+    return math.isfinite(sum(values.ravel().tolist()))
 
 
 def _finite_actions(actions: Any, ignored: Mask) -> NDArray[Any]:

@@ -175,6 +175,9 @@ class ProcessData(Protocol):
     def forget(self, nodes: Sequence[int]) -> None:
         """Forget the configuration of nodes that have restarted: nothing counts as mapped."""
 
+    def before(self, node: int, key: Key) -> int | None:
+        """Return the value that `restore` gives an object of a node; None for one that was not changed."""
+
     def restore(self, node: int) -> None:
         """Restore a node's configuration.
 
@@ -225,6 +228,9 @@ class MasterWatch(Protocol):
 
     def holds(self, key: Key) -> bool:
         """Return whether the watchdogs in force depend on an object; the program must not change it then."""
+
+    def before(self, node: int, key: Key) -> int | None:
+        """Return the value that `restore` gives an object of a node; None for one that was not changed."""
 
     def restore(self, node: int) -> None:
         """Restore a node's watchdog. The caller has proved that its axes are off.

@@ -404,12 +404,16 @@ class BusDrives:
         return np.array(values, np.int64 if entry.high is None or entry.high < 2**63 else np.uint64)
 
     def read_axis(self, entry: Entry, axis: int) -> Any:
-        """Read an object of one axis; of one that the envelope has overridden, the program's value."""
+        """Read an object of one axis; of one that was changed for as long as the bus is used, its own value."""
         found = self.read_raw(entry, axis)
+        if (own := self._before_mapping(entry, axis)) is not None:
+            return own
         return found if self.safety is None or not isinstance(found, int) else self.safety.own(entry, axis, found)
 
     def write_axis(self, entry: Entry, axis: int, value: int | str) -> None:
         """Write an object of one axis, past the envelope; of one that it has overridden, store the value."""
+        if self._before_mapping(entry, axis) is not None:
+            self._restore_process_data()
         if isinstance(value, str) or self.safety is None or not self.safety.write_lent(entry, axis, value):
             self.write_raw(entry, axis, value)
 
@@ -421,8 +425,13 @@ class BusDrives:
             self._catch_up()
 
     # --- inside ---------------------------------------------------------------------------------------------------
+    def _before_mapping(self, entry: Entry, axis: int) -> int | None:
+        """Return an object's own value while process data are mapped over it, else None."""
+        node, index, sub, _ = self._place_of(entry, axis)
+        return self._link.process.before(node, (index, sub))
+
     def _restore_process_data(self) -> None:
-        """Restore the nodes' own process data, which they are about to store; the next cycle maps what it needs."""
+        """Restore the nodes' own process data, which are stored or written next; the next cycle maps what it needs."""
         nodes = range(len(self.nodes))
         for k in nodes:
             self._link.process.restore(k)

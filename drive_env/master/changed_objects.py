@@ -40,6 +40,10 @@ class ChangedObjects:
         """Return whether a watchdog set with these objects depends on a key, changed or already right (6007h)."""
         return key in self or key == _ABORT_CONNECTION
 
+    def before(self, key: Key) -> int | None:
+        """Return the value that an object is given back later; None if it was not changed."""
+        return int.from_bytes(self._before[key], "little") if key in self._before else None
+
     def read(self, key: Key) -> bytes:
         """Return the bytes of an object."""
         return self._sdo.read(*key, f"{key[0]:04X}h:{key[1]:02X}", self._description.answer_timeout)

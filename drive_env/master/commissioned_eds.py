@@ -51,6 +51,12 @@ def commissioned_values(drives: Drives, node: int = 0, axis: int | None = None) 
     return found
 
 
+def own_bit_rate(drives: Drives) -> int | None:
+    """Return the bit rate that a node on a bus reports [kbit/s]; None for a device without such an object."""
+    key = None if drives.device is None else drives.device.canopen.objects.get("active_bit_rate")
+    return None if key is None else int(drives.read(key)[0])
+
+
 def commissioned_eds(
     eds: Path | EdsText, values: Mapping[Key, int], name: str, *, node_id: int | None = None, bit_rate: int = CAN_KBIT
 ) -> str:

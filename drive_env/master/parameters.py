@@ -140,9 +140,11 @@ def write_all_or_none(drives: DescribedAxes, wanted: Mapping[Key, int], axis: in
 
 
 def check_at_rest(drives: DescribedAxes, wanted: Iterable[Key], axis: int = 0) -> None:
-    """Raise NotRestoredError if an axis that these parameters affect may turn."""
-    if any(_is_live(drives, other) for other in _affected(drives, wanted, axis)):
-        raise NotRestoredError("the axis is enabled, and parameters are not exchanged under way; disable it first")
+    """Raise NotRestoredError, naming it among several, if an axis that these parameters affect may turn."""
+    live = next((other for other in _affected(drives, wanted, axis) if _is_live(drives, other)), None)
+    if live is not None:
+        which = f"axis {live}" if len(drives.nodes) * drives.description.num_axes > 1 else "the axis"
+        raise NotRestoredError(f"{which} is enabled, and parameters are not exchanged under way; disable it first")
 
 
 def _affected(drives: DescribedAxes, wanted: Iterable[Key], axis: int) -> Iterable[int]:

@@ -154,7 +154,7 @@ class Envelope:
             self._arm()
         if self._axes.is_armed:
             self._stops.keep_ramps(key, raw, where)
-        if entry.index == STORE and self._is_ours():
+        if (entry.index == STORE or self._is_mapped_over(key)) and self._is_ours():
             self._give_all_back(entry)
         if key in scale_objects(self._drives.description):
             self._limits.keep_place()
@@ -186,15 +186,20 @@ class Envelope:
                 self._limits.lend()  # also corrects software limits
 
     def _give_all_back(self, entry: Entry) -> None:
-        """Give limits and watchdogs back before the drives store what they have; the next command arms anew."""
+        """Give limits and watchdogs back before the drives store or map what they have; the next command arms anew."""
         if self._watch.look_for_live():
             raise SafetyError(
-                f"{entry.label}: the drives would store the limits and the watchdog that they were lent while an axis "
+                f"{entry.label}: the drives would lose the limits and the watchdog that they were lent while an axis "
                 "is enabled; nothing was sent. Disable it first"
             )
         self._lending.give_back(set(range(self._drives.num_axes)))
         self.close()
         self._check_none_lost()
+
+    def _is_mapped_over(self, key: Key) -> bool:
+        """Return whether an object is of process data that were mapped for as long as the drives are open."""
+        process = self._drives.link.process
+        return any(process.before(node, key) is not None for node in range(len(self._drives.nodes)))
 
     def _is_limit(self, key: Key) -> bool:
         """Return whether the limits or the stopping distance depend on an object."""
@@ -225,7 +230,7 @@ class Envelope:
 
     def own(self, entry: Entry, axis: int, found: int) -> int:
         """Return the program's own value of an object; `found`, the value read, if none is lent."""
-        return self._lending.own((entry.index, entry.sub), axis, found)
+        return self._lending.own((entry.index, entry.sub), axis, self._watchdogs.own(entry, axis, found))
 
     def before_play(self, played: Mapping[Entry, Integers]) -> None:
         """Raise SafetyError for rows that would pass a limit; arm the watch if they command motion."""

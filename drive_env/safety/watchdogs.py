@@ -70,6 +70,12 @@ class Watchdogs:
                 "was sent. Write it before the first command, or without this program"
             )
 
+    def own(self, entry: Entry, axis: int, found: int) -> int:
+        """Return the value that an object had before a watchdog was set; `found`, the value read, otherwise."""
+        node, part = divmod(axis, self._drives.description.num_axes)
+        before = self._watch.before(node, self._drives.description.key(entry, part))
+        return found if before is None else before
+
     def keep(self) -> None:
         """Send a sign of life to the drives, when it is due."""
         self._watch.keep()

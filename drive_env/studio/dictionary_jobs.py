@@ -121,11 +121,6 @@ def store(axis: int) -> Callable[[Drives], None]:
     return lambda drives: drives.write((0x1010, 1), SAVE, where=np.arange(drives.num_axes) == axis)
 
 
-def snapshot(known: Description, axis: int) -> Callable[[Drives], dict[Key, int]]:
-    """Return the job that reads all parameters of an axis."""
-    return lambda drives: read_parameters(SingleAxes(drives, known), axis)
-
-
 def factory(known: Description) -> dict[Key, int]:
     """Return the default values of parameters in the EDS, without those that have none."""
     described: Any = _DescriptionAlone(known)

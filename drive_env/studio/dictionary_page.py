@@ -349,9 +349,6 @@ class DictionaryPanel:
         title = "Store the parameters"
         done = await self._visitor.do(lambda drives: (jobs.store(self._axis)(drives), True)[1], title)
         if done:
-            found = await self._visitor.do(jobs.snapshot(self._known, self._axis), "Read what was stored")
-            if found is not None:
-                self._session.stored[self._axis] = found
             self._visitor.say("the drive keeps its parameters from now on", "done")
 
     async def _restore(self, event: UploadEventArguments) -> None:

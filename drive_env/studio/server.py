@@ -176,7 +176,7 @@ def _stops(studio: Studio) -> FastAPI:
     @web.post(QUICK_STOP)
     async def quick_stop() -> dict[str, bool]:
         studio.session.stop_now("the button or the space bar of a page")
-        return {"stopped": True}
+        return {"asked": True}
 
     @web.websocket(LIFE)
     async def life(line: WebSocket, page: str = "") -> None:

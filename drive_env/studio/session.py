@@ -115,7 +115,7 @@ class Session:
         when_not_opened: Called by the drives' thread in this case.
         presence: The open pages.
         recorder: The recorder of samples.
-        stored: Parameters by axis that the drive is known to have stored: those at the start.
+        stored: Parameters by axis that the drive is known to have stored: those at the start, or when it stored last.
         scopes: The scope of each axis that a page has shown; it waits for its trigger even if no page shows it.
         at_end: Functions that restore changes, called by the drives' thread before the drives are closed, when nothing
             turns.
@@ -354,10 +354,11 @@ class Session:
             self._drives = SharedDrives(
                 self._real, self.recorder, self._look, self._hear, self.presence.moves, self._why_stopped
             )
+            self._drives.when_stored = self._read_stored
             self._states = AxisStates(self._real, self.description, self.workspace.units)
             self._choose_samples()
             self._drives.advance(PIECE)  # emulators are compiled here
-            self._read_stored()
+            self._read_stored(np.ones(self.num_axes, bool))
             self.state = "open"
             while not self._is_closing:
                 job = self._next()
@@ -371,16 +372,21 @@ class Session:
         finally:
             self._end()
 
-    def _read_stored(self) -> None:
-        """Read the parameters of every axis: after a start they are the stored ones."""
+    def _read_stored(self, where: Mask) -> None:
+        """Read the parameters of the nodes of some axes: they are those stored after a start, or a write of 1010h."""
         assert self._drives is not None
         drives = self._drives
-        self.stored = {axis: {} for axis in range(self.num_axes)}
-        for entry in parameters(SingleAxes(drives, self.description)):
+        axes = SingleAxes(drives, self.description)
+        per_node = axes.description.num_axes
+        there = [axis for axis in range(self.num_axes) if where.reshape(-1, per_node)[axis // per_node].any()]
+        found: dict[int, dict[Key, int]] = {axis: {} for axis in there}
+        for entry in parameters(axes):
             key = (entry.index, entry.sub)
             with contextlib.suppress(ObjectAccessError):
-                for axis, value in enumerate(drives.read(key).tolist()):
-                    self.stored[axis][key] = int(value)
+                values = drives.read(key)
+                for axis in there:
+                    found[axis][key] = int(values[axis])
+        self.stored |= found
 
     def _end(self) -> None:
         real = self._real
@@ -546,14 +552,13 @@ class Session:
 
     def _leave_alone(self, job: Job | None) -> None:
         """Stop and disable all axes, since no page shows an enabled axis."""
-        if not self._is_left:
-            self._is_left = True
-            self.say("warning", "the last page was closed with an axis enabled: the axes were stopped and disabled")
         if job is not None and not job.stopped:
             job.stopped = "the last page was closed"
         self._stop(np.ones(self.num_axes, bool))
         assert self._real is not None
-        self._bring_to_rest(self._real)
+        if self._bring_to_rest(self._real) and not self._is_left:
+            self._is_left = True
+            self.say("warning", "the last page was closed with an axis enabled: the axes were stopped and disabled")
 
     def _stop(self, axes: Mask) -> None:
         """Quick-stop live axes; it bypasses `_look`, which calls it."""
@@ -568,8 +573,8 @@ class Session:
         except Exception as error:  # the bus failed: the drive's watchdog acts
             self.say("error", sentence(error))
 
-    def _bring_to_rest(self, real: Drives) -> None:
-        """Wait until no axis turns, then switch the voltage off."""
+    def _bring_to_rest(self, real: Drives) -> bool:
+        """Wait until no axis turns, then switch the voltage off; return whether it was possible, else say why not."""
         assert self._drives is not None
         try:
             with self._drives.lock:
@@ -580,8 +585,10 @@ class Session:
                     waited += PIECE
                 if live.any():
                     motion.disable(real, where=live)
+            return True
         except Exception as error:
             self.say("error", sentence(error))
+            return False
 
     def _is_any_live(self) -> bool:
         newest = self.recorder.newest().get((cia402.STATUSWORD, 0))

@@ -24,6 +24,7 @@ from drive_env.drives.drives_proxy import DrivesProxy
 from drive_env.drives.interface import CYCLE, Drives
 from drive_env.drives.trace import Trace
 from drive_env.safety.errors import SafetyError
+from drive_env.safety.objects import STORE
 from drive_env.studio.errors import JobStoppedError
 from drive_env.studio.recorder import ScopeRecorder
 from mechanics.arrays import Integers, Mask
@@ -78,6 +79,7 @@ class SharedDrives(DrivesProxy):
     Attributes:
         lock: Held during calls of emulated drives: a stop from another thread waits for one piece at most.
         paced: Whether emulated time passes in real time; otherwise at full speed.
+        when_stored: Called with the axes whose nodes have stored their parameters (1010h:01).
         moved: Axes that the present job may have moved, shape (num_axes,): by a controlword that enables operation, or
             by a set-point.
     """
@@ -94,6 +96,7 @@ class SharedDrives(DrivesProxy):
         super().__init__(drives)
         self.lock = threading.RLock()
         self.paced = True
+        self.when_stored: Callable[[Mask], None] = lambda where: None
         self.moved: Mask = np.zeros(drives.num_axes, bool)
         self._recorder = recorder
         self._look = look
@@ -129,6 +132,8 @@ class SharedDrives(DrivesProxy):
             raise
         if name in self._set_points:
             self.moved = moves
+        if name == (STORE, 1):
+            self.when_stored(np.broadcast_to(True if where is None else where, (self.num_axes,)))
 
     def advance(self, duration: float) -> None:
         """Let time pass [s], whole communication cycles, and record it."""

@@ -4,9 +4,17 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
+import canopen
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from drive_env import EmulatedDrives
+from drive_env.bus.hub import Hub
+from drive_env.bus.server import Server
+from drive_env.bus.wire import Wire
+from drive_env.bus.world import World
+from drive_env.commands.cli import app
 from drive_env.devices import find_device
 from drive_env.dictionary.eds_file import object_section
 from drive_env.dictionary.entries import EdsText, eds_file
@@ -72,3 +80,18 @@ def test_a_dcf_names_its_node_and_counts_its_revision():
     assert (found["DeviceComissioning"]["NodeID"], found["DeviceComissioning"]["Baudrate"]) == ("9", "500")
     assert found["FileInfo"]["LastEDS"] == before["FileName"] and found["FileInfo"]["FileName"] == "own.dcf"
     assert int(found["FileInfo"]["FileRevision"]) == int(before.get("FileRevision", "0")) + 1
+
+
+def test_a_dcf_of_a_drive_on_a_bus_has_the_bit_rate_that_it_reports(tmp_path, monkeypatch):
+    world = World(wire=Wire(bit_rate=500_000, instant=True))
+    monkeypatch.chdir(tmp_path)
+    with EmulatedDrives(load="inertia", num_threads=1) as emulated:
+        emulated.advance(0.001)  # compiles: a node that does would not answer in time
+        world.add(emulated, [3])
+        hub = Hub()
+        with Server(world, hub):
+            bus = ("--interface", "slcan", "--channel", hub.channel, "--node", "3")
+            done = CliRunner().invoke(app, ["export", "dcf", "a.dcf", *bus])
+            assert done.exit_code == 0 and "as node 3 at 500 kbit/s" in done.stdout, done.output
+            assert canopen.import_od("a.dcf").bitrate == 500_000
+        world.close()

@@ -274,8 +274,8 @@ def test_objects_of_another_width_are_taken_as_the_file_has_them(made):
         seen = drives.record([0x6077, 0x6064], 0.05, play={0x607A: np.full(50, int(drives.read(0x6064)[0]))})
         assert seen[0x6077].shape == (50, 1)
         assert drives.read(0x6061)[0] == 8
-        mapped = [int(drives.read((0x1A00 + k, sub))[0]) for k in range(2) for sub in (1, 2)]
-        assert 0x60770020 in mapped
+        mapped = [drives.description.dictionary.find((0x1A00 + k, sub)) for k in range(2) for sub in (1, 2)]
+        assert 0x60770020 in [drives.read_raw(one, 0) for one in mapped]
 
 
 def test_a_drive_without_a_watchdog_is_refused_with_the_remedy_and_moves_with_it(made, caplog):

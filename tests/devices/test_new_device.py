@@ -40,7 +40,10 @@ from drive_env.drives.speeds import per_increment
 from drive_env.fieldbus.description import describe
 from drive_env.master.commissioned_eds import commissioned_eds, commissioned_values
 from drive_env.motors import find_motor
+from tuning import target
 from tuning.commands.cli import app as tune
+from tuning.identify.identification import identify
+from tuning.response.frequency_response import measure
 
 FILES = files()
 # rpm; scaled counts, 6060h write-only; two axes; PDOs that can only be read; a DCF
@@ -175,6 +178,34 @@ def test_it_is_identified_and_tuned_as_a_drive_of_ours(folders, name):
         tune, ["commission", *known, *steps, "--yes", "--out", str(folders[name].folder.parent / f"path_{name}")]
     )
     assert found.exit_code == 0 and "Current loop done" in found.output, found.output
+
+
+@pytest.mark.parametrize(
+    ("name", "lacks"),
+    [("everest_ed1", "no cst"), ("lotus_2", "no csp, no csv, no cst"), ("cascade_cm2", "no 6065h:00"),
+     ("granit_fu3", "no pp, no csp, no csv, no cst")],
+)  # fmt: skip
+def test_what_it_lacks_to_be_identified_is_named_before_anything_moves(folders, tmp_path, monkeypatch, name, lacks):
+    known, told = str(folders[name].folder), f"this drive has {lacks}, by which its loops are measured"
+    monkeypatch.chdir(tmp_path)
+    for command in ("auto", "auto --by rule", "auto --by tpe", "auto --dry-run", "identify", "rules"):
+        refused = CliRunner().invoke(tune, [*command.split(), "--device", known, "--load", "inertia"])
+        assert refused.exit_code == 2 and told in refused.stderr, refused.output
+    assert not any(tmp_path.iterdir())
+    if find_device(known).new_dictionary().has(0x6064):
+        with target.emulated(known, "inertia") as axis:
+            with pytest.raises(ValueError, match=told):
+                identify(axis)
+            assert axis.drives.read(0x6041)[0] & 0x6F == 0x40  # never enabled
+
+
+def test_a_response_needs_the_mode_of_its_loop_alone(folders):
+    lotus, everest = (str(folders[name].folder) for name in ("lotus_2", "everest_ed1"))
+    for loop, mode in (("velocity", "csv"), ("position", "csp")):
+        refused = CliRunner().invoke(tune, ["response", loop, "--device", lotus])
+        assert refused.exit_code == 2 and f"has no {mode}, by which" in refused.stderr, refused.output
+    with target.emulated(everest, "inertia") as axis:  # without cst
+        assert measure(axis, "velocity").fits[0] is not None
 
 
 @contextmanager
@@ -901,7 +932,7 @@ def test_eds_and_dcf_have_the_commissioned_values_and_python_canopen_reads_them(
     assert (dcf.node_id, dcf.bitrate, dcf[0x1400][1].value) == (1, 1_000_000, 0x201)
     assert "LastEDS=alpina_ax40.eds" in (tmp_path / "a.dcf").read_text(encoding="utf-8")  # which it was made of
     assert eds_done.stdout.endswith(f"parameters of {folder}\n")
-    assert dcf_done.stdout.endswith(f"parameters of {folder}, as node 1\n")
+    assert dcf_done.stdout.endswith(f"parameters of {folder}, as node 1 at 1000 kbit/s\n")
     printed = run("export", "eds", "-", "--device", folder).stdout  # as the device has it
     assert printed == find_device(str(folder)).eds.read_text(encoding="utf-8")
     assert run("export", "eds", "-", *of_motor).stdout != printed

@@ -403,7 +403,7 @@ def test_a_program_that_dies_in_real_time_leaves_no_axis_running(inside, gate):
         def script():
             with CanDrives("tgz_d", bus=bus, safety=LIMITS, timeout=1.0) as drives:
                 turn(drives)
-                assert drives.bus.read((0x1029, 1))[0] == 2, (
+                assert drives.bus.read_raw(drives.description.dictionary.find((0x1029, 1)), 0) == 2, (
                     "a dead master must stop the axes, not make them pre-operational"
                 )
                 world.cycle = cut

@@ -35,6 +35,7 @@ from drive_env.master.ethercat.slave_objects import SlaveObjects
 from drive_env.master.ethercat.soem_master import SoemMaster
 from drive_env.master.ethercat_drives import EtherCatDrives
 from drive_env.master.open_drives import default_nodes, open_drives
+from drive_env.master.parameters import read_parameters
 
 SAMPLED = [0x6041, 0x6064, 0x606C]
 EACH = np.array([1, 2, 3])
@@ -130,7 +131,9 @@ def test_it_goes_to_op_when_a_motor_is_to_run_and_to_init_at_the_end():
 @pytest.mark.slow
 def test_an_image_is_changed_while_no_axis_is_enabled_and_put_back():
     with linked(pace="real-time") as (drives, segment):
+        own = read_parameters(drives)
         drives.record([0x6041, 0x6077], 0.003)
+        assert read_parameters(drives) == own, "a backup has nothing of our image"
         assert [entry.index for entry in drives.sampled_entries()] == [0x6041, 0x6077, 0x6064]
         motion.enable(drives, mode="csp")
         refused = "cannot be changed while axis 0 is enabled; record or play it once before enabling"

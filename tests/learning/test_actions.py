@@ -1,5 +1,7 @@
 """What is no number reaches no drive: refused before anything is sent, with environment, entry and value."""
 
+import re
+
 import gymnasium
 import numpy as np
 import pytest
@@ -68,6 +70,19 @@ def test_emulated_environments_refuse_it_too(name, value):
         lanes.step(actions)
     lanes.step(np.zeros_like(actions))
     lanes.close()
+
+
+@pytest.mark.parametrize("name", ENVIRONMENTS)
+def test_actions_of_another_shape_are_refused_by_it(name):
+    lanes = ENVIRONMENTS[name](2, load="inertia", num_threads=1)
+    alone = gymnasium.make(name, load="inertia", num_threads=1).unwrapped
+    for env in (lanes, alone):
+        env.reset(seed=0)
+        shape = env.action_space.shape
+        for other in ((3, *shape), (0,), (*shape[:-1], shape[-1] + 1)):
+            with pytest.raises(ValueError, match=re.escape(f"the action has shape {other}, and {shape} is taken")):
+                env.step(np.zeros(other))
+        env.close()
 
 
 def test_lists_and_huge_numbers_are_numbers():

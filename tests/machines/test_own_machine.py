@@ -172,6 +172,17 @@ def test_zeros_are_refused_where_nothing_would_turn_and_ignored_where_others_do(
     assert find_load(Load(free, joints="x")).joints == ("x",)
 
 
+@pytest.mark.parametrize(
+    ("joint", "wrong"),
+    [('damping="nan"', "dof_damping of the MJCF has nan"), ('damping="-1"', "dof_damping .* has -1; .*0 or more"),
+     ('limited="true" range="nan 1"', "jnt_range of the MJCF has nan"), ('ref="inf"', "qpos0 of the MJCF has inf")],
+)  # fmt: skip
+def test_numbers_by_which_a_machine_would_be_frozen_or_run_away_are_refused(file, joint, wrong):
+    path = file(two().replace('name="x"', f'name="x" {joint}', 1))
+    with pytest.raises(ValueError, match=wrong):
+        find_load(path)
+
+
 THERE = r"the model has the joints x, turn and the fixed tendons belt"
 
 
@@ -184,8 +195,9 @@ THERE = r"the model has the joints x, turn and the fixed tendons belt"
         ({"joints": ("x", "x")}, r"names a joint twice: x, x; a joint takes one drive"),
         ({"joints": ("x", "turn"), "gear": (1.0,)}, r"has 2 driven joints and 1 gears"),
         ({"joints": ("x", "turn"), "gear": (1.0, 0.0)}, r"the gear of 'turn' is 0, and its rotor would turn nothing"),
-        ({"joints": "x", "gear": 0.0}, r"the gear of 'x' is 0, .*give a finite number"),
-        ({"joints": "x", "gear": float("inf")}, r"the gear of 'x' is inf, "),
+        ({"joints": "x", "gear": 0.0}, r"the gear of 'x' is 0, .*of 1e-09 to 1e\+09 in size"),
+        ({"joints": "x", "gear": float("inf")}, r"the gear of 'x' is inf; "),
+        ({"joints": "x", "gear": 1e300}, r"the gear of 'x' is 1e\+300; "),
         (
             {"joints": "x", "contacts": (Contact("stop", {"x": 0.0}, -1.0, 1.0, 1e4, 1.0),)},
             r"its contact 'stop' has 0 of 'x', which is no motion; give a joint a coefficient",

@@ -226,7 +226,7 @@ def running(num_machines=6, load="two_mass"):
 @pytest.mark.every(3)
 @pytest.mark.parametrize(
     ("load", "torque"),
-    [*((load, (-1e8, np.inf)[k % 2]) for k, load in enumerate(LOADS)), ("two_mass", 1e8), ("inertia", 1e12)],
+    [*((load, (-1e8, 1e300)[k % 2]) for k, load in enumerate(LOADS)), ("two_mass", 1e8), ("inertia", 1e12)],
 )
 def test_a_diverging_machine_is_frozen_alone(load, torque, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # MuJoCo writes its warnings to a log file where it stands
@@ -291,11 +291,15 @@ def test_divergence_leaves_no_file_behind(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_torque_that_is_no_number_is_refused():
+def test_a_torque_or_temperature_that_is_not_finite_is_refused():
     drives = running(2)
-    with pytest.raises(ValueError, match="load torque must be a number, not nan"):
-        drives.machine.load_torque = [0.01, np.nan]
+    for value in (np.nan, np.inf, -np.inf):
+        with pytest.raises(ValueError, match=f"load torque must be finite, not {value:g}; give a finite number"):
+            drives.machine.load_torque = [0.01, value]
+        with pytest.raises(ValueError, match=f"a temperature must be finite, not {value:g} degC"):
+            drives.machine.set_temperatures(40.0, [25.0, value])
     assert drives.machine.load_torque.tolist() == [0.0, 0.0]
+    assert drives.machine.temperatures[0].max() < 26.0
     with pytest.raises(ValueError, match="one for each of 2 machines"):
         drives.machine.load_torque = [0.0, 0.0, 0.0]
 

@@ -7,9 +7,11 @@ import re
 
 import pytest
 from rigs.scripted_drive import ScriptedBus, ScriptedDrive
+from rigs.served_drives import node
+from rigs.served_drives import parameters as parameters_by
 from typer.testing import CliRunner
 
-from drive_env import CanDrives
+from drive_env import CanDrives, motion
 from drive_env.commands.cli import app
 from drive_env.devices import find_device
 from drive_env.fieldbus.description import CIA_402
@@ -248,3 +250,16 @@ def test_an_axis_that_may_turn_is_not_restored(drive, file, status):
     drive.set(0x6041, status)
     code, _, error = run("parameters", "restore", file, "--yes")
     assert (code, "the axis is enabled" in error, writes(drive)) == (REFUSED, True, [])
+
+
+def test_what_is_read_while_an_axis_is_enabled_is_the_drives_own():
+    """Neither our process data nor our watchdog (1016h), which are given back at the end."""
+    with node(lockstep=False) as (_, bus):
+        own = parameters_by(bus)
+        with CanDrives(interface="slcan", channel=bus[3]) as drives:
+            motion.enable(drives, mode="pp")
+            drives.record([0x6064, 0x606C, 0x6077], 0.005)
+            heartbeat, mapped = (drives.description.dictionary.find(key) for key in ((0x1016, 1), (0x1A00, 1)))
+            assert parameters.read_parameters(drives) == own
+            assert drives.read_raw(heartbeat, 0) != own[0x1016, 1] and drives.read_raw(mapped, 0) != own[0x1A00, 1]
+        assert parameters_by(bus) == own

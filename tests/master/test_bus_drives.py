@@ -55,6 +55,9 @@ class Process:
         self.link, self.mapping, self.mapped = link, 0, ((), ())
         self.broken, self.rows = set(), {}
 
+    def before(self, node, key):
+        return None
+
     def check_sampled(self, entries):
         pass
 

@@ -213,10 +213,11 @@ def test_what_commands_and_serves_by_cia_301_and_402():
 def test_no_axis_that_a_change_touches_may_be_enabled(keys, affected):
     for live in range(6):
         drives = SimpleNamespace(
+            nodes=(1, 2),
             description=SimpleNamespace(num_axes=3, dictionary=SimpleNamespace(find=lambda index: index)),
             read_axis=lambda index, axis, live=live: 0x0637 if (index, axis) == (0x6041, live) else 0x0240,
         )
-        said = pytest.raises(NotRestoredError, match="the axis is enabled, and parameters are not exchanged under way")
+        said = pytest.raises(NotRestoredError, match=f"^axis {live} is enabled, and parameters are not exchanged")
         with said if live in affected else contextlib.nullcontext():
             check_at_rest(drives, keys, 4)
 

@@ -34,6 +34,7 @@ class HeldObjects:
         self.num_axes, self.nodes, self.time_waits, self.is_dry = num_axes, tuple(range(1, num_axes + 1)), False, False
         self.refused, self.takes, self.own = set(refused), takes or {}, own
         self.device = None  # they are known by their EDS alone
+        self.link = SimpleNamespace(process=SimpleNamespace(before=lambda node, key: None))
         self.log = []  # (object, axis, value) as they were written
         units = UNITS | (units or {})
         self.entries = {

@@ -184,6 +184,9 @@ class Images:
         self.mapping += 1
         self._played = self._sampled = ()
 
+    def before(self, node, key):
+        return None
+
     def restore(self, node):
         self._link.bus.nodes[node].state = State.PREOP
         self._link.bus.nodes[node].configure((), ())
@@ -271,6 +274,9 @@ class ImageWatch:
 
     def holds(self, key):
         return any(ours and o.holds(key) for ours, o in zip(self._is_ours, self._objects, strict=True))
+
+    def before(self, node, key):
+        return self._objects[node].before(key)
 
     def restore(self, node):
         self._objects[node].restore()

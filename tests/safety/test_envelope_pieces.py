@@ -89,7 +89,11 @@ def envelope_of(is_armed=False, live=True):
     done, nothing = [], lambda *arguments: None
     made = Envelope.__new__(Envelope)
     made._drives = SimpleNamespace(
-        description=SimpleNamespace(dictionary=SimpleNamespace(roles={}), has=lambda key: False, role=lambda part: None)
+        description=SimpleNamespace(
+            dictionary=SimpleNamespace(roles={}), has=lambda key: False, role=lambda part: None
+        ),
+        nodes=(),
+        link=SimpleNamespace(process=None),
     )
     made._axes, made._set_points = SimpleNamespace(is_armed=is_armed), frozenset(SET_POINTS)
     made._axes.may_turn = np.zeros(1, bool)

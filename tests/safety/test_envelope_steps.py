@@ -179,6 +179,10 @@ def test_what_is_stored_is_the_drives_own_and_nothing_is_while_an_axis_is_live()
     bench.done.clear()
     bench.before(STORE)
     assert not bench.asked("give_back")
+    bench = Bench().is_ready()
+    bench.drives.link.process.before = lambda node, key: 0 if key == PRODUCER else None  # as if it were mapped over
+    with pytest.raises(SafetyError, match=r"limits and the watchdog .* an axis is enabled.*Disable it first"):
+        bench.before(PRODUCER)
 
 
 def test_who_writes_a_scale_has_the_rotors_keep_their_place():
@@ -251,9 +255,9 @@ def test_a_value_for_an_object_that_has_another_one_meanwhile(key, value, done):
 
 def test_what_a_program_sees_is_its_own():
     bench = Bench()
-    bench.lending.answers["own"] = 5
+    bench.watchdogs.answers["own"], bench.lending.answers["own"] = 4, 5
     assert bench.envelope.own(bench.entry(WINDOW), 1, 3) == 5
-    assert bench.done == [("own", WINDOW, 1, 3)]
+    assert bench.done == [("own", bench.entry(WINDOW), 1, 3), ("own", WINDOW, 1, 4)]
 
 
 # --- controlwords ---------------------------------------------------------------------------------------------------

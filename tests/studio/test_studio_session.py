@@ -4,19 +4,24 @@ from __future__ import annotations
 
 import threading
 import time
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
 from rigs.session_rig import Beats, opened, until
 from rigs.small_eds import FOLDER
+from rigs.world_bus import bus_of
 
-from drive_env import EmulatedDrives, cia402, motion
+from drive_env import CanDrives, EmulatedDrives, SafetyError, cia402, motion
 from drive_env.cia402 import State
 from drive_env.devices.new_device import new_device
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.roles import Role
 from drive_env.drives.limit_at_rest import SHARE
 from drive_env.fieldbus.description import describe
+from drive_env.fieldbus.errors import BusError
+from drive_env.master.parameters import read_parameters
+from drive_env.master.single_axes import SingleAxes
 from drive_env.motors import find_motor
 from drive_env.studio import dictionary_jobs, motion_jobs, presence
 from drive_env.studio.errors import JobEndedError
@@ -448,6 +453,7 @@ def test_a_release_that_overtakes_its_jog_wins(session):
 
 
 def test_without_any_page_an_axis_is_stopped_and_disabled(session, monkeypatch):
+    session.presence.beat("page")
     monkeypatch.setattr(presence, "ABANDONED", 0.4)
     with Beats(session):
         session.do(motion_jobs.enable(0, "pv"), "enable").result(10)
@@ -459,6 +465,19 @@ def test_without_any_page_an_axis_is_stopped_and_disabled(session, monkeypatch):
     until(lambda: state_of(session) is State.SWITCH_ON_DISABLED)
     assert speed_of(session) == 0
     assert sum("last page" in event.text for event in session.events) == 1
+
+
+def test_axes_that_could_not_be_stopped_are_not_told_as_stopped(session, monkeypatch):
+    def silent(*_):
+        raise BusError("node 1 does not answer")
+
+    with Beats(session):
+        session.do(motion_jobs.enable(0, "pv"), "enable").result(10)
+        monkeypatch.setattr("drive_env.studio.session._stop_live", silent)
+    monkeypatch.setattr(presence, "ABANDONED", 0.2)
+    until(lambda: any("node 1 does not answer" in event.text for event in session.events))
+    assert not any("were stopped" in event.text for event in session.events)
+    monkeypatch.undo()
 
 
 def test_presence_counts_pages_and_their_motions():
@@ -530,6 +549,62 @@ def test_a_current_at_its_limit_at_rest_is_told(session):
         assert any("its current is at its limit" in event.text for event in session.events)
         session.do(motion_jobs.disable(0), "disable").result(20)
         until(lambda: not session.axes[0].is_at_limit and session.axes[0].current_share < 0.2)
+
+
+def test_a_bus_in_use_has_its_own_process_data_in_backups_and_takes_others():
+    """What the studio maps and watches by is its own: a backup has none of it, and a restore leaves it able to see."""
+    with EmulatedDrives(load="inertia", num_threads=1) as emulated, bus_of(emulated, (5,), stay=True) as bus:
+        lent = {"bus": bus, "nodes": (5,), "pace": "lockstep"}
+        known = describe("tmcm1636", None)
+        with CanDrives(safety=False, **lent) as drives:
+            own = read_parameters(drives)
+            text = dictionary_jobs.backup(known, 0)(drives)
+        with serving(Session(lambda: CanDrives(**lent), "a drive", known)) as made:
+            assert made.stored[0] == own
+            made.do(motion_jobs.enable(0, "pp"), "enable").result(20)
+            mapped = known.dictionary.find((0x1A00, 1))
+            with pytest.raises(SafetyError, match="while an axis is enabled; nothing was sent"):
+                made.do(dictionary_jobs.write(mapped, own[0x1A00, 1], 0), "write").result(20)
+            made.do(motion_jobs.disable(0), "disable").result(20)
+            assert made.do(lambda drives: read_parameters(SingleAxes(drives, known)), "read").result(20) == own
+            kind = known.dictionary.find((0x1801, 2))
+            assert made.do(dictionary_jobs.write(kind, 254, 0), "write").result(20) == 254
+            job = dictionary_jobs.restore(known, text.encode(), "b.toml", 0, unchecked=False, other_drive=False)
+            assert [change.entry for change in made.do(job, "restore").result(20)] == [kind]
+            assert made.do(dictionary_jobs.write(kind, 254, 0), "write").result(20) == 254
+            made.do(motion_jobs.enable(0, "pp"), "enable").result(20)
+            made.do(motion_jobs.move(made, 0, "1 rev", "600 rpm", relative=True), "move").result(20)
+            seen = int(made.recorder.newest()[cia402.POSITION_ACTUAL, 0][0])
+            assert seen == pytest.approx(65536, abs=1000)
+            assert int(emulated.read(cia402.POSITION_ACTUAL)[0]) == pytest.approx(65536, abs=1000)
+            assert not made.events
+        with CanDrives(safety=False, **lent) as drives:
+            assert read_parameters(drives) == own | {(0x1801, 2): 254}
+
+
+def test_what_a_module_has_stored_is_that_of_all_its_axes():
+    emulated = EmulatedDrives("tmcm6212", num_machines=6, load="inertia", num_threads=1)
+    with emulated, bus_of(emulated, (5,), stay=True) as bus:
+        open_drives = lambda: CanDrives("tmcm6212", bus=bus, nodes=(5,), pace="lockstep")  # noqa: E731
+        with serving(Session(open_drives, "a module", describe("tmcm6212", None))) as made:
+            own = made.stored[3][cia402.PROFILE_VELOCITY, 0]
+            made.do(lambda drives: drives.write(cia402.PROFILE_VELOCITY, own + 7), "write").result(20)
+            assert made.stored[3][cia402.PROFILE_VELOCITY, 0] == own
+            made.do(dictionary_jobs.store(1), "store").result(20)
+            assert {one[cia402.PROFILE_VELOCITY, 0] for one in made.stored.values()} == {own + 7}
+
+
+@contextmanager
+def serving(made):
+    """A session of drives of a bus, with a page."""
+    made.presence.beat("page")
+    made.start()
+    try:
+        until(lambda: made.state != "opening", 120.0)
+        with Beats(made):
+            yield made
+    finally:
+        made.close()
 
 
 def test_a_backup_is_restored_where_a_machine_has_fewer_axes_than_its_device():

@@ -432,13 +432,14 @@ def test_a_watchdog_of_another_program_stays_while_its_axis_is_enabled(run, shar
     bus = can.Bus(interface="virtual", channel=channel)
     with CanDrives(bus=bus, timeout=20, safety=Limits(silence=20.0, stall=30.0)) as drives:
         motion.enable(drives, "pv")
-        watched = int(drives.read((0x1016, 1))[0])
+        heartbeat = drives.description.dictionary.find((0x1016, 1))
+        watched = int(drives.read_raw(heartbeat, 0))
         assert watched >> 16 & 0x7F and watched & 0xFFFF == 20_000
         for name in ("1016:01", "1029:01", "100C"):
             code, out, error = run("set", name, 0, "--yes")
             assert (code, out) == (REFUSED, ""), error
             assert "node 1 (" in error and "is part of what stops it when its master dies" in error
-        assert int(drives.read((0x1016, 1))[0]) == watched
+        assert int(drives.read_raw(heartbeat, 0)) == watched
         motion.disable(drives)
     bus.shutdown()
     assert int(machine.read(0x6041)[0]) & 0x4F == 0x40

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import gzip
 import json
 import os
 import shutil
 import signal
+import sqlite3
 import struct
 import subprocess
 import sys
@@ -199,6 +201,43 @@ def test_a_capture_of_ours_comes_back_and_one_that_is_cut_off_is_refused(tmp_pat
         path.write_bytes(content)
         with pytest.raises(ValueError, match=why):
             recorded_frames.read_frames(path, everything=True)
+
+
+@pytest.mark.parametrize("packed", ["", ".gz"])
+def test_a_blf_that_is_cut_off_is_refused(tmp_path, in_process, packed):
+    """python-can reads as many whole containers as there are, and says nothing of the rest."""
+    with can.Logger(str(tmp_path / "a.blf")) as writer:
+        for _ in range(3000):
+            writer(can.Message(timestamp=1.5, arbitration_id=0x601, data=os.urandom(8), is_extended_id=False))
+    whole = (tmp_path / "a.blf").read_bytes()
+    for size, count in ((len(whole), 3000), (len(whole) - 1, None), (len(whole) // 2, None)):
+        path = tmp_path / f"{size}.blf{packed}"
+        path.write_bytes(gzip.compress(whole[:size]) if packed else whole[:size])
+        if count:
+            assert len(recorded_frames.read_frames(path, everything=False)[0]) == count
+            continue
+        with pytest.raises(ValueError, match=f"it has {size} of {len(whole)} bytes, and was cut off"):
+            recorded_frames.read_frames(path, everything=False)
+
+
+def test_a_database_has_all_frames_that_came_in_a_burst(tmp_path, monkeypatch):
+    """python-can's own end writes one batch of those that wait, 501 at most."""
+    waiting = [FRAMES["data"]] * 2000
+
+    class Bus:
+        def recv(self, _):
+            if not waiting:
+                signal.raise_signal(signal.SIGINT)
+            return waiting.pop() if waiting else None
+
+        def shutdown(self):
+            pass
+
+    monkeypatch.setattr(port, "open_bus", lambda *_, **__: Bus())
+    done = CliRunner().invoke(app, ["frames", "log", str(tmp_path / "a.db")])
+    assert done.exit_code == 0 and done.stdout.startswith("2000 frames written"), done.output
+    with contextlib.closing(sqlite3.connect(tmp_path / "a.db")) as written:
+        assert written.execute("SELECT COUNT(*) FROM messages").fetchone() == (2000,)
 
 
 def test_a_channel_has_no_blanks(tmp_path):

@@ -32,10 +32,12 @@ def test_rules_show_gains_margins_and_what_a_relay_measured():
 @pytest.mark.slow
 def test_rules_say_which_of_them_keep_the_dynamics_asked_for():
     kept = {}
-    for dynamics in ("soft", "40/7/2.2"):
-        done = drive_tune("rules", "margin_45", "margin_60", "--load", "inertia", "--dynamics", dynamics)
+    for dynamics, loads in (("soft", "0.5/2"), ("40/7/2.2", "0.8/3")):
+        done = drive_tune("rules", "margin_45", "margin_60", "--load", "inertia", "--dynamics", dynamics,
+                          "--inertia-range", loads)  # fmt: skip
         assert done.exit_code == 0, done.output
-        assert f"kept: by {dynamics} dynamics" in done.stdout
+        low, high = loads.split("/")
+        assert f"kept: by {dynamics} dynamics, load inertia x {low} to x {high}" in done.stdout
         rows = [line.split() for line in done.stdout.splitlines() if line.startswith("margin_")]
         kept[dynamics] = {row[0]: row[-1] for row in rows}
         assert all(row[-3].count("/") == row[-2].count("/") == 2 for row in rows)  # of both loops

@@ -5,23 +5,29 @@ The truth is what the emulator has; a run that believes to have put everything b
 
 from __future__ import annotations
 
+import re
 import signal
 import subprocess
 import sys
 import time
 from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
 
 import can
 import numpy as np
 import pytest
 from rigs.auto_stages import skip_stages
+from rigs.commands import drive_tune as drive_tune_wide
 from rigs.served_drives import GAIN_OBJECTS, PATIENCE, environment, files, node, parameters, status_is, wait_until
 from typer.testing import CliRunner
 
 from agents.tuner import tuning_run
 from drive_env import cia402, motion
+from drive_env.devices import find_device
 from drive_env.fieldbus.description import Description
 from drive_env.master.can.port import Port
+from drive_env.master.parameters import Difference
 from tuning.auto import one_button as auto_module
 from tuning.commands.cli import app as drive_tune
 from tuning.snapshot import SET_POINTS, Transaction, differences
@@ -45,6 +51,24 @@ def target_of(bus):
 
 def undo(file):
     return CliRunner().invoke(drive_tune, ["undo", str(file), "--yes"])
+
+
+@pytest.mark.parametrize(("axes", "told"), [(1, "changed still: 2041h"), (2, "changed still: axis 1: 2041h")])
+def test_a_change_on_one_axis_of_several_names_it(monkeypatch, axes, told):
+    entry = find_device("tmcm1636").new_dictionary().find(GAIN_OBJECTS[0])
+    snapshot = SimpleNamespace(axes=({},) * axes, left_out={})
+    monkeypatch.setattr("tuning.way_back.load_snapshot", lambda file: snapshot)
+    monkeypatch.setattr("tuning.way_back.read_anew", lambda given: [(axes - 1, Difference(entry, 1, 2))])
+    assert what_is_changed("before.toml").startswith(told)
+
+
+@pytest.mark.parametrize("by", ["tpe", "rule", "agent"])
+def test_an_axis_that_is_rejected_before_its_gains_are_searched_says_why(by):
+    with node() as (_, bus):
+        done = drive_tune_wide("auto", "--by", by, *bus, "--travel", "-0.01:0.01", "--yes", "--out", "run")
+    assert done.exit_code == 1 and "axis 0 was not tuned: the travel is too short" in done.stdout, done.output
+    written = re.search(r"written to run: (.*)", done.stdout)[1].split(", ")
+    assert sorted(written) == sorted(path.name for path in Path("run").iterdir())
 
 
 # --- the commands -------------------------------------------------------------------------------------------------

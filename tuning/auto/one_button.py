@@ -22,7 +22,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from drive_env.devices.gains import check_linear_model
 from drive_env.loops.dynamics import DEFAULT, INERTIA_RANGE, Dynamics, find_dynamics
 from drive_env.trials.demand import COMPUTED, is_recorded
 from tuning.auto.bench import AutoBench
@@ -34,6 +33,7 @@ from tuning.auto.moves import record_previous_gains
 from tuning.auto.settings import begin, commission, write
 from tuning.auto.stages import Basis, RecordedGains, collect
 from tuning.identify.quick_identification import identify_briefly
+from tuning.identify.working_state import check_identifiable
 from tuning.lateness import told_lateness
 from tuning.outcome import Outcome
 from tuning.rules.rules_by_name import check_rule, propose
@@ -96,11 +96,11 @@ def auto(
             must remove its files if the block in it fails.
 
     Raises:
-        ValueError: For a drive without a linear model of its loops, before anything is written.
+        ValueError: For a drive that cannot be identified, before anything is written.
         BusError: If the drives can no longer be reached; the message has their state and how to undo.
         OSError: If a file cannot be written; the drives then have their state from before.
     """
-    check_linear_model(target.device)
+    check_identifiable(target.device)
     with Transaction(target, file) as transaction, timed(target) as (watched, clock):
         bench = AutoBench(watched, clock, method.budget, find_dynamics(dynamics))
         progress("checking the drives", 0.0)

@@ -154,9 +154,10 @@ def _search(
                     target, here, lambda what, share: show(share), seed=drive.seed, keep=store, dynamics=asked,
                     method=search.method(here),
                 )  # fmt: skip
-            if not json:
+            searched = None if search.done is None else {"search": search.as_dict(before)}  # axes rejected before it
+            if searched is not None and not json:
                 search.print(before)
-            _report(target, result._replace(file=folder / BEFORE), folder, json, {"search": search.as_dict(before)})
+            _report(target, result._replace(file=folder / BEFORE), folder, json, searched)
     unfinished.discard(folder)
     if not result.accepted.all():
         raise typer.Exit(REFUSED)

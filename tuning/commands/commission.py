@@ -89,15 +89,20 @@ def commission(
     writes certificate.json and report.html. Exit code 1 if a step failed, or you quit.
     """
     with errors_as_exit_codes():
+        from drive_env.devices import find_device
+        from drive_env.devices.gains import has_linear_model
         from tuning.commissioning.axis_limits import raw_limits
         from tuning.commissioning.bench import CommissioningPlan
         from tuning.commissioning.homing import check_method
         from tuning.commissioning.path import BEFORE, CommissioningPath
         from tuning.runs import provenance
+        from tuning.target import check_measurable
         from tuning.way_back import way_back
 
         chosen = _chosen(step, skip)
         asked = asked_dynamics(dynamics, drive.device, inertia_range)
+        if has_linear_model(device := find_device(drive.device)):
+            check_measurable(device, ())
         plan = CommissioningPlan(asked, method, _limits(limit), store, drive.seed)
         _check_used(plan, chosen)
         folder = provenance.run_folder("commission") if out is None else out

@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 def check_can_be_told(name: str) -> None:
     """Raise ValueError for a device whose writes cannot be listed beforehand."""
     from drive_env.devices import find_device
-    from drive_env.devices.gains import check_linear_model
+    from tuning.identify.working_state import check_identifiable
 
     if (device := find_device(name)).gains.is_open_loop:
         raise ValueError(
             f"--dry-run: what a run writes to a {device.name} follows from what it measures, and cannot be listed "
             "before; leave --dry-run out: drive-tune undo restores a drive on a bus from before.toml of the run"
         )
-    check_linear_model(device)
+    check_identifiable(device)
 
 
 def tell_plan(target: Target, method: OpenedMethod, folder: Path, *, keep: bool, json: bool) -> None:

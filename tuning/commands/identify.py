@@ -57,7 +57,7 @@ def identify(
             check_free(out, "choose another --out")
             check_writable(out)
         drive.check()
-        drive.check_linear_model()
+        drive.check_identifiable()
         file = file_of(drive, "identify", None if out is None else out.with_suffix(""))
         from drive_env.whole_file import write_whole
         from tuning.identify.identification import identify as run

@@ -170,9 +170,9 @@ def open_method(
         ValueError: For an unknown rule or agent, or a device that the method cannot tune.
     """
     from drive_env.devices import find_device
-    from drive_env.devices.gains import check_linear_model
     from tuning.auto.one_button import BUDGET, by_rule
     from tuning.auto.one_button import DESIGN as WITH_TWINS
+    from tuning.identify.working_state import check_identifiable
 
     if by == AGENT:
         opened: OpenedMethod = import_method(AGENT).open_method(
@@ -181,7 +181,7 @@ def open_method(
         return opened
     known = find_device(device)
     if by == RULE or not known.gains.is_open_loop:
-        check_linear_model(known)
+        check_identifiable(known)
     if by == RULE:
         ruled = by_rule(options.rule or RULE_BY_DEFAULT)
         return OpenedMethod(f"a trial of the gains that the {ruled.tuner} proposes", ruled.budget, lambda target: ruled)

@@ -193,12 +193,12 @@ class DriveOptions:
                 "--device FOLDER (the page on file formats, section Device, has the list)"
             )
 
-    def check_linear_model(self) -> None:
-        """Raise ValueError for a drive without a linear model of its loops; called before the user is asked."""
+    def check_identifiable(self) -> None:
+        """Raise ValueError for a drive that cannot be identified; called before the user is asked."""
         from drive_env.devices import find_device
-        from drive_env.devices.gains import check_linear_model
+        from tuning.identify.working_state import check_identifiable
 
-        check_linear_model(find_device(self.device))
+        check_identifiable(find_device(self.device))
 
     def machine(self) -> dict[str, Any]:
         """Return the options as arguments of `tuning.target.emulated`; raises as `open_target`."""

@@ -61,8 +61,11 @@ def response(
     --out or in runs/.
     """
     with errors_as_exit_codes():
+        from drive_env.devices import find_device
+        from tuning.response.excitation_run import MODE
         from tuning.response.frequency_response import Signal, measure
         from tuning.runs import provenance
+        from tuning.target import check_measurable
 
         if out is not None:
             provenance.check_folder(out)
@@ -71,7 +74,7 @@ def response(
                 "--trace is for emulated drives, up to 1000 Hz; leave out --high and --bus, or leave out --trace"
             )
         drive.check()
-        drive.check_linear_model()
+        check_measurable(find_device(drive.device), (MODE.get(loop, "csv"),))
         file = file_of(drive, "response", out)
         with unchanged(drive, file) as (target, _), progress_bar("shaking") as show:
             measured = measure(target, loop, signal=Signal(signal, low, high, resolution), traced=trace, progress=show)

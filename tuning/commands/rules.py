@@ -49,10 +49,10 @@ def rules(
     """Identify an axis and show the gains that each rule proposes, with the margins they would have.
 
     Margins of the velocity and the position loop are computed by the identified model. Gains keep the --dynamics if
-    this axis keeps them, with the overshoot of a csp step, and its variants (load inertia x 0.5 and x 2, stiffness x
-    0.8, velocity P x 0.67 and x 1.5) keep weaker margins. Notes name limits of the integer gains. Afterwards the drive
-    has its own parameters; on a bus they are also saved to a file for `drive-tune undo`, in runs/. A rule's gains are
-    written by `drive-tune auto --by rule`.
+    this axis keeps them, with the overshoot of a csp step, and its variants (load inertia at both ends of
+    --inertia-range, x 0.5 and x 2 by default, stiffness x 0.8, velocity P x 0.67 and x 1.5) keep weaker margins. Notes
+    name limits of the integer gains. Afterwards the drive has its own parameters; on a bus they are also saved to a
+    file for `drive-tune undo`, in runs/. A rule's gains are written by `drive-tune auto --by rule`.
     """
     with errors_as_exit_codes():
         from tuning.compare.side_by_side import AxisRules, identified_plants, proposals, swung_proposals
@@ -62,7 +62,7 @@ def rules(
         for name in chosen:
             check_rule(name)
         drive.check()
-        drive.check_linear_model()
+        drive.check_identifiable()
         asked = asked_dynamics(dynamics, drive.device, inertia_range)
         before = file_of(drive, "rules")
         with unchanged(drive, before) as (target, _):
@@ -102,6 +102,7 @@ def _as_json(target: Target, axis: AxisRules, dynamics: Dynamics) -> dict[str, A
     return {
         "plant": asdict(plant),
         "dynamics": dynamics.name,
+        "inertia_range": list(dynamics.inertia_range),
         "proposals": {
             name: {
                 "gains": dict(zip(target.device.gains.names, proposal.gains, strict=True)),
@@ -126,7 +127,11 @@ def _print(target: Target, shown: AxisRules, dynamics: Dynamics, axis: int | Non
         print_lines([f"{head}{plant}"])
         return
     pair = f", resonances at {plant.anti_resonance:.0f} and {plant.resonance:.0f} Hz" if plant.is_elastic else ", rigid"
-    title = f"{head}inertia {plant.inertia:.3g} kg m^2{pair}; kept: by {dynamics.name} dynamics"
+    low, high = dynamics.inertia_range
+    title = (
+        f"{head}inertia {plant.inertia:.3g} kg m^2{pair}; kept: by {dynamics.name} dynamics, load inertia x {low:g} to "
+        f"x {high:g}"
+    )
     titles = (*_gain_titles(target.device.gains), "velocity\n°/dB/Ms", "position\n°/dB/Ms", "kept")
     cells, slack = [], slacks(target, plant, rows, dynamics)
     for name, proposal in rows.items():

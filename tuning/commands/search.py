@@ -271,6 +271,7 @@ def open_search(
     from drive_env.devices.gains import has_linear_model
     from drive_env.trials.method import check_tried
     from tuning.commands.options import asked_dynamics
+    from tuning.identify.working_state import check_identifiable
     from tuning.runs import provenance
     from tuning.search.optimise import Settings
 
@@ -283,6 +284,8 @@ def open_search(
     device = find_device(drive.device)
     searched = tuple(options.gains) if options.gains else device.gains.outer
     check_tried(device, searched)  # checked before anything moves
+    if has_linear_model(device):
+        check_identifiable(device)
     asked = asked_dynamics(dynamics, drive.device, inertia_range)
     settings = Settings(
         sampler=by,

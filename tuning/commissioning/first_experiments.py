@@ -25,6 +25,7 @@ class FirstExperiments(Experiments):
     thorough = False
 
     def __init__(self, target: Target, progress: Progress, *, pulses: bool) -> None:
+        self.modes = ("csp", "csv", "cst") if pulses else ("csv",)
         super().__init__(target, np.ones(target.num_axes, bool), progress)
         self.good: Mask = np.zeros(target.num_axes, bool)
         self._pulses = pulses

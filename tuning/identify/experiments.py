@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drive_env import cia402
-from drive_env.devices.gains import bandwidth_gains, check_linear_model
+from drive_env.devices.gains import bandwidth_gains
 from drive_env.dictionary.roles import Role
 from drive_env.drives.currents import ampere_per_count
 from drive_env.drives.interface import CYCLE
@@ -29,9 +29,11 @@ from tuning.identify.working_state import (
     BY_ENCODER,
     BY_HALLS,
     GUESS,
+    MODES,
     Working,
     cautious_bandwidth,
     cautious_gains,
+    check_identifiable,
     enable,
     go_back,
     read_role,
@@ -76,11 +78,12 @@ class Experiments:
         found: Present results of each axis, by the names of `NAMES`.
     """
 
+    modes: tuple[str, ...] = MODES
     thorough = True  # include experiments that only narrow an interval
     corrects = False  # wiring settings also of drives that are already commissioned
 
     def __init__(self, target: Target, where: Mask, progress: Progress) -> None:
-        check_linear_model(target.device)  # it determines the gains of the experiments
+        check_identifiable(target.device, self.modes)
         self.target, self.where, self.progress = target, where, progress
         self._drives = target.drives
         self._at_rest: list[Estimate] = []  # resistances at rest, if they are measured

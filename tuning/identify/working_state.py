@@ -7,7 +7,7 @@ gains from the data sheet that are slow enough for any load, and profile, limits
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -27,13 +27,14 @@ from drive_env.motors import Motor
 from mechanics.arrays import Floats, Integers, Mask
 from tuning.identify.wiring import FINDINGS
 from tuning.stop_causes import told_causes
-from tuning.target import Target
+from tuning.target import Target, check_measurable
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
 
 
 BOTH_ENDS = 3  # bits of 60FDh, and the value of 2005h that disables both limit switches
+MODES = ("pp", "csp", "csv", "cst")  # in which axes are identified
 STOP_MODE = 1 << 8  # of 2101h: enabled, but not in a mode yet, since the encoder is being aligned
 
 
@@ -47,6 +48,12 @@ def borrowed(device: Device) -> tuple[ObjectName, ...]:
     (cia402.INTERPOLATION_PERIOD, 1), (cia402.INTERPOLATION_PERIOD, 2),
 )  # fmt: skip
     return tuple(name for name in names if not isinstance(name, Role) or name in device.roles)
+
+
+def check_identifiable(device: Device, modes: Iterable[str] = MODES) -> None:
+    """Raise ValueError unless a device has the linear model, modes and objects of experiments."""
+    numbers = (name for name in borrowed(device) if not isinstance(name, Role | str))
+    check_measurable(device, modes, [(name, 0) if isinstance(name, int) else name for name in numbers])
 
 
 def read_role(target: Target, role: Role) -> Integers:

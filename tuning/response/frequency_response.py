@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from drive_env import cia402
-from drive_env.devices.gains import check_linear_model
 from drive_env.drives.currents import ampere_per_count, read_current_limit
 from drive_env.drives.interface import CYCLE
 from drive_env.drives.raw_gains import read_gains
@@ -35,7 +34,7 @@ from tuning.response.plant_fit import PlantFit, Seen, fit_plant
 from tuning.response.transfer import directions, transfer
 from tuning.rules.lags import velocity_noise
 from tuning.stop_causes import stop_causes
-from tuning.target import timed
+from tuning.target import check_measurable, timed
 
 if TYPE_CHECKING:
     from drive_env.devices import Device
@@ -145,7 +144,7 @@ def measure(
     axes = np.ones(target.num_axes, bool) if where is None else np.asarray(where, bool)
     if not axes.any():
         raise ValueError("no axis is chosen")
-    check_linear_model(target.device)  # it determines the amplitudes; checked before anything moves
+    check_measurable(target.device, (MODE[loop],))  # it determines the amplitudes; checked before anything moves
     closed = _closed_loops(target, loop)
     if not (axes & closed).any():
         raise ValueError("a P gain is 0 on every axis and the loop is open: give the drives gains first")

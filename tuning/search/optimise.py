@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from drive_env import cia402
-from drive_env.devices.gains import RAW_MAX, check_linear_model
+from drive_env.devices.gains import RAW_MAX
 from drive_env.drives.raw_gains import write_gains
 from drive_env.loops.dynamics import find_dynamics
 from drive_env.trials.method import check_tried
@@ -28,6 +28,7 @@ from drive_env.trials.position_pid import STEADY_SPEEDS, SWING, PidTrials
 from drive_env.trials.positioning import wrapped
 from drive_env.trials.score import TRIP, robust_cost
 from mechanics.arrays import Floats, Integers
+from tuning.identify.working_state import check_identifiable
 from tuning.runs.shard_log import ShardLog
 from tuning.search.model_margins import ModelMargins
 from tuning.search.samplers import SAMPLERS, Proposer, Study, load, new_proposer
@@ -195,7 +196,7 @@ def optimise(
     check_tried(target.device, chosen)  # checked before anything moves
     columns = target.device.gains.columns(chosen)
     if settings.dynamics is not None:
-        check_linear_model(target.device)
+        check_identifiable(target.device)
     with timed(target) as (watched, clock):
         known = None
         if settings.dynamics is not None:

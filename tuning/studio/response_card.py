@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 from nicegui import ui
 
-from drive_env.devices.gains import check_linear_model
 from drive_env.studio import charts
 from tuning.auto.loop_margins import AskedMargin, asked_margins
 from tuning.studio import response_charts, tune_jobs
 from tuning.studio.rules_card import table
 from tuning.studio.tune_panel import TunePanel, card
+from tuning.target import check_measurable
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -75,7 +75,7 @@ class ResponseCard:
         panel = self._panel
         with card("Frequency response, soft to stiff", "response"):
             try:
-                check_linear_model(panel.device)
+                check_measurable(panel.device, ("csv",))
             except ValueError as error:
                 ui.label(str(error)).classes("studio-hint")
                 return

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 from nicegui import ui
 
-from drive_env.devices.gains import check_linear_model
 from tuning.estimate import interval
 from tuning.identify.identified_axis import TITLES
+from tuning.identify.working_state import check_identifiable
 from tuning.rules.rules_by_name import MEANINGS
 from tuning.studio import tune_jobs
 from tuning.studio.tune_panel import TunePanel, card
@@ -50,7 +50,7 @@ class RulesCard:
         panel = self._panel
         with card("Identification and rules", "rules"):
             try:
-                check_linear_model(panel.device)
+                check_identifiable(panel.device)
             except ValueError as error:
                 ui.label(str(error)).classes("studio-hint")
                 return

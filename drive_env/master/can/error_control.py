@@ -166,6 +166,10 @@ class ErrorControl:
         """Return whether the watchdog, if it is set, depends on an object."""
         return self.kind != "none" and (key == _ERROR_BEHAVIOUR or self._objects.holds(key))
 
+    def before(self, key: tuple[int, int]) -> int | None:
+        """Return the value that an object had before the watchdog was set; None for one that is its own."""
+        return self._objects.before(key)
+
     def beat(self) -> None:
         """Send a guarding request, if the node has no heartbeat consumer."""
         if self.kind == "life guarding":
@@ -330,6 +334,10 @@ class ErrorControls:
     def holds(self, key: tuple[int, int]) -> bool:
         """Return whether a watchdog that is set depends on an object."""
         return any(control.holds(key) for control in self._controls)
+
+    def before(self, node: int, key: tuple[int, int]) -> int | None:
+        """Return the value that an object of a node had before its watchdog was set; None for one that is its own."""
+        return self._controls[node].before(key)
 
     def restore(self, node: int) -> None:
         """Restore a node's objects.

@@ -7,6 +7,7 @@ from functools import partial
 from typing import NamedTuple
 
 from drive_env.canopen.frames import EXTENDED, IDENTIFIER, INVALID, RPDO, TPDO
+from drive_env.cia402 import Key
 from drive_env.dictionary.aborts import CANNOT_BE_MAPPED, PDO_LENGTH_EXCEEDED, ObjectAccessError
 from drive_env.dictionary.access import fits_pdo
 from drive_env.dictionary.entries import Entry
@@ -220,6 +221,19 @@ class PdoConfiguration:
             self._put(*kind, SYNC_EVERY, 1, self._sdo.write)
         label = f"{direction.name} {number + 1} of node {self._node}"
         return RemotePdo(label, before.cob_id & IDENTIFIER, start, tuple(members))
+
+    def before(self, key: Key) -> int | None:
+        """Return the value that an object had before it was changed here; None if it was not changed."""
+        (index, sub), number = key, key[0] & 0x1FF
+        for direction in (INTO_DRIVE, OUT_OF_DRIVE):
+            found = self._before.get((direction.name, number))
+            if index == direction.mapping + number and found is not None:
+                return dict(enumerate((found.in_use, *found.mapping))).get(sub)
+            if index == direction.communication + number and found is not None:
+                return {1: found.cob_id, 2: found.kind}.get(sub)
+        if index == OUT_OF_DRIVE.communication + number:
+            return {1: self._silenced, 2: self._types}.get(sub, {}).get(number)
+        return None
 
     def restore(self) -> None:
         """Restore every PDO as found.

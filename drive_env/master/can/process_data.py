@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+from drive_env.cia402 import Key
 from drive_env.dictionary.aborts import PDO_LENGTH_EXCEEDED, ObjectAccessError
 from drive_env.dictionary.entries import Entry
 from drive_env.fieldbus.description import Description
@@ -168,6 +169,10 @@ class PdoProcessData:
         self.mapping += 1
         self._mapped.clear()
         self._plans.clear()  # fixed PDOs may have changed with the reset
+
+    def before(self, node: int, key: Key) -> int | None:
+        """Return the value that an object of a node had before its PDOs were mapped; None for one that is its own."""
+        return self._configurations[node].before(key)
 
     def restore(self, node: int) -> None:
         """Restore every PDO of a node.

@@ -222,6 +222,10 @@ class EtherCatProcessData:
         for k in nodes:
             self._slaves[k].forget()
 
+    def before(self, node: int, key: Key) -> int | None:
+        """Return the value that an object of a node had before its image was changed; None for one that is its own."""
+        return self._slaves[node].before(key)
+
     def restore(self, node: int) -> None:
         """Take a node out of Op and restore its mapping; BusError if not all of it could be restored."""
         with self.turn:

@@ -117,6 +117,10 @@ class ProcessWatchdog:
         """Return whether the watchdogs that are set depend on an object."""
         return any(k in self._set and one.holds(key) for k, one in enumerate(self._objects))
 
+    def before(self, node: int, key: Key) -> int | None:
+        """Return the value that an object of a node had before its watchdog was set; None for one that is its own."""
+        return self._objects[node].before(key)
+
     def restore(self, node: int) -> None:
         """Restore a node's watchdog; BusError if it did not accept all of it."""
         self._set.pop(node, None)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from functools import partial
 
+from drive_env.cia402 import Key
 from drive_env.dictionary.aborts import ObjectAccessError
 from drive_env.dictionary.roles import Role
 from drive_env.fieldbus.description import Description
@@ -61,6 +62,15 @@ class SlaveImages:
         if before != wanted:
             self._write(*self._cycle_key, 4, wanted)
             self._cycle_before = before
+
+    def before(self, key: Key) -> int | None:
+        """Return the value that an object had before it was changed here; None if it was not changed."""
+        if key == self._cycle_key:
+            return self._cycle_before
+        lists = {one: values for _, mappings in self._before.values() for one, values in mappings.items()}
+        lists |= {direction: assigned for direction, (assigned, _) in self._before.items()}
+        values = lists.get(key[0])
+        return None if values is None else dict(enumerate((len(values), *values))).get(key[1])
 
     def restore(self) -> None:
         """Restore assignments, mappings and cycle; BusError if not all of it could be restored."""
