@@ -274,10 +274,8 @@ class RobustScore(Saved):
             device, found, motor, num_machines * self._runs, distinct=1, num_threads=num_threads,
             friction=friction, physics_steps=2 if faster else 1,
         )  # fmt: skip
-        if repeats > 1:  # the first noise is that of a score without repeats, and all variants of a run share it
-            seeds = np.tile(np.repeat(_NOISE * np.arange(1.0, repeats + 1.0), len(self.variants)), num_machines)
-            later = np.tile(np.repeat(np.arange(repeats) > 0, len(self.variants)), num_machines)
-            self._drives.machine.seed_noise(seeds, later)
+        if repeats > 1:
+            self._seed_noise()
         packed = one(found)
         self._ways = way(packed).joints
         levers = np.abs(self._ways @ packed.plant.disturbance[:, 0])
@@ -295,6 +293,11 @@ class RobustScore(Saved):
         self._reference = np.ones((axes[0], axes[2]))  # E_0 [rad s]
         zero = np.zeros(self._drives.num_axes)
         self._move = plan_move(self._drives.motor, zero + self._drives.motor.inertia, 1.0, zero)
+
+    def _seed_noise(self) -> None:
+        """Give every run its noise: the first that of a score without repeats, and all variants of a run the same."""
+        run = np.tile(np.repeat(np.arange(self.repeats), len(self.variants)), self.num_machines)
+        self._drives.machine.seed_noise(_NOISE * (run + 1.0), run > 0)
 
     def set_machines(self, parameters: Mapping[str, Floats], supply: Floats, where: Mask | None = None) -> None:
         """Set the machines to score, (num_machines,): values of `drives.machine.parameters`, and supply voltage."""

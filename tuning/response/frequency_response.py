@@ -125,22 +125,7 @@ def measure(
         ValueError: For an unknown loop or kind, impossible frequencies, a trace on a bus, or a drive without a linear
             model of its loops.
     """
-    if loop not in LOOPS:
-        raise ValueError(
-            f"no loop is named {loop!r}; there are {', '.join(LOOPS)}; the current loop cannot be measured on a bus"
-        )
-    if traced and target.drives.machine is None:
-        raise ValueError(
-            "a trace at the velocity loop's rate exists on emulated drives only; on a bus up to 400 Hz can be measured"
-        )
-    lowest, highest = RANGE[loop]
-    # The trace begins where a bus ends: a gap between them could hide a margin.
-    top = BUS_LIMIT if traced else highest if signal.high is None else signal.high
-    if top > BUS_LIMIT:
-        raise ValueError(f"highest frequency {top:g} Hz must be at most {BUS_LIMIT:g} Hz, the limit on a bus")
-    # In a trace, a set-point held at f also appears at 1000 Hz - f: lines up to nearly half of it leave no gap.
-    low = lowest if signal.low is None else signal.low
-    lines = plan_lines(low, TRACED_TOP if traced else top, signal.resolution, 1.0 / CYCLE)
+    lines, top = _planned(target, loop, signal, traced)
     axes = np.ones(target.num_axes, bool) if where is None else np.asarray(where, bool)
     if not axes.any():
         raise ValueError("no axis is chosen")
@@ -176,6 +161,26 @@ def measure(
         (*own, open_loop) if without else own for own, without in zip(whole.notes, axes & ~closed, strict=True)
     )
     return replace(whole, notes=notes)
+
+
+def _planned(target: Target, loop: str, signal: Signal, traced: bool) -> tuple[Lines, float]:
+    """Return the excited lines, and the highest frequency [Hz] seen by a bus; ValueError for impossible ones."""
+    if loop not in LOOPS:
+        raise ValueError(
+            f"no loop is named {loop!r}; there are {', '.join(LOOPS)}; the current loop cannot be measured on a bus"
+        )
+    if traced and target.drives.machine is None:
+        raise ValueError(
+            "a trace at the velocity loop's rate exists on emulated drives only; on a bus up to 400 Hz can be measured"
+        )
+    lowest, highest = RANGE[loop]
+    # The trace begins where a bus ends: a gap between them could hide a margin.
+    top = BUS_LIMIT if traced else highest if signal.high is None else signal.high
+    if top > BUS_LIMIT:
+        raise ValueError(f"highest frequency {top:g} Hz must be at most {BUS_LIMIT:g} Hz, the limit on a bus")
+    # In a trace, a set-point held at f also appears at 1000 Hz - f: lines up to nearly half of it leave no gap.
+    low = lowest if signal.low is None else signal.low
+    return plan_lines(low, TRACED_TOP if traced else top, signal.resolution, 1.0 / CYCLE), top
 
 
 def _closed_loops(target: Target, loop: str) -> Mask:
