@@ -186,3 +186,15 @@ def test_gains_that_a_trial_would_stop_count_for_worse(monkeypatch):
         assert calm == slack[math.inf][0]
         assert shaking == pytest.approx(max(min(slack[math.inf][1], 1.0 - swings[1] / limit), -5.0))
     assert slack[0.8 * OSCILLATION][1] < 0.0
+
+
+def test_a_twin_rests_long_enough_to_show_gains_that_swing_at_rest(monkeypatch):
+    """An integrator first has to bring it to the next count: a drawn fan swung by 10 % of the rated current."""
+    motor = find_motor("re_35")
+    fan = Plant.from_data_sheet(DEVICE, motor, 29.0, 4.55e-5, R=1.22, L=3.3e-4, velocity_filter=198.0)
+    gains, slack = np.array([[[908, 9718, 2262, 700, 500], [908, 9718, 1600, 1200, 300]]]), {}
+    for rest in (0.0, twin.REST):
+        monkeypatch.setattr(twin, "REST", rest)
+        with closing(Twins(DEVICE, motor, [Known(fan, math.inf, 0.06, 1.5e-4)], scaler(), 2, 1, ONE, 8)) as twins:
+            slack[rest] = twins.judge(gains)[1][0]
+    assert (slack[0.0] > 0.0).all() and (slack[twin.REST] > 0.0).tolist() == [False, True]
