@@ -607,6 +607,7 @@ class Steppers:
 
 def score_of(kind, *records, **options):
     made = kind.__new__(kind)
+    made._rest = 0.0
     made.variants, made.num_machines, made.repeats = VARIANTS[:3], 2, 1
     made._runs, made._axes, made._drives = 3, (2, 3, 1), Steppers(*records, **options)
     made._constant, made._load_torque, made._t_0 = np.array([0.01] * 6), -0.03, np.full(6, 0.01)

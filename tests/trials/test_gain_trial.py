@@ -124,9 +124,9 @@ def test_a_swing_is_the_largest_of_any_window_of_25_ms_and_each_axis_has_its_own
     np.testing.assert_allclose(swing(current, 2.0), [max(0.25, np.sqrt(2 * 4.0 / 24) / 2.0), 0.0])
 
 
-def test_a_swing_at_rest_is_about_its_trend_and_of_the_last_45_ms_before_the_load_step():
-    current = np.zeros((TRIAL, 3))
-    current[:QUIET], current[SETTLED:] = 9.0, -9.0  # the move, and the load step
+def test_a_swing_at_rest_is_about_its_trend_after_the_first_105_ms():
+    current = np.zeros((SETTLED, 3))
+    current[:QUIET] = 9.0  # the move
     late = np.arange(SETTLED - QUIET) - (SETTLED - QUIET - 1) / 2.0
     wave = 0.4 * np.cos(2.0 * np.pi * late / 15.0)
     current[QUIET:SETTLED] = np.stack(
@@ -134,6 +134,14 @@ def test_a_swing_at_rest_is_about_its_trend_and_of_the_last_45_ms_before_the_loa
     )  # the last one creeps
     rms = 0.4 / np.sqrt(2.0) / 2.0
     np.testing.assert_allclose(resting_swing(current, 2.0), [rms, rms, 0.0], atol=1e-12)
+
+
+def test_a_longer_rest_has_a_trend_in_each_tenth_of_a_second():
+    """An integrator that brings an axis slowly to the next count and back is no swing."""
+    saw = np.tile(np.concatenate([np.arange(100.0), np.arange(100.0)[::-1]]), 2)[:, None]
+    current = np.concatenate([np.zeros((QUIET, 1)), saw])
+    np.testing.assert_allclose(resting_swing(current, 2.0), 0.0, atol=1e-12)
+    assert resting_swing(np.concatenate([current[:QUIET], saw[50:350]]), 2.0) > 3.0, "the turn of it within a window is"
 
 
 # --- identification -------------------------------------------------------------------------------------------------

@@ -108,6 +108,34 @@ def test_gains_with_which_the_axis_oscillates_while_it_is_measured_fail_and_do_n
     assert 1 <= swings.sum() <= 17, "the axis is calm within 100 ms after the trial of a third of a second"
 
 
+class RealTimeDrives(ObservedDrives):
+    """Drives whose time passes by itself, as on a bus."""
+
+    time_waits = False
+
+
+@pytest.mark.parametrize(("kind", "live"), [(ObservedDrives, True), (RealTimeDrives, False)])
+def test_in_real_time_an_axis_is_off_while_its_response_is_evaluated(kind, live, monkeypatch):
+    """An envelope in real time stops an enabled axis that gets no command for a second, and the fit takes one."""
+    fit, seen = frequency_response.fit_plant, []
+    with emulated(load="inertia", num_threads=1) as target:
+        drives, true = kind(target.drives), true_plant(target.drives)
+
+        def fitting(*args):
+            seen.append(bool(cia402.matches(drives.read(cia402.STATUSWORD), cia402.OPERATION_ENABLED)[0]))
+            return fit(*args)
+
+        monkeypatch.setattr(frequency_response, "fit_plant", fitting)
+        motion.enable(drives, mode="csv")
+        with timed(replace(target, drives=drives)) as (watched, clock):
+            bench = AutoBench(watched, clock, 60.0, find_dynamics("standard"))
+            move = SimpleNamespace(distance=np.array([16384]))
+            bench.ground = SimpleNamespace(move=move, begin_here=lambda where: None)
+            found = basis(GAINS[None], plant=true, found=Identification({}, 0.0))
+            after = auto_margins.measure(bench, found, recorded(GAINS[None]), np.ones(1, bool))
+    assert after.unseen[0] == "" and seen == [live] * len(seen) != []
+
+
 # --- both loops, by a measured velocity loop --------------------------------------------------------------------------
 GAINS = np.array([8009, 9699, 847, 1112, 1420])
 OTHERS = np.array([[4021, 1573, 445, 329, 118], [8009, 9699, 500, 600, 700], [6000, 4000, 900, 1000, 1400]])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -21,6 +22,7 @@ from mechanics.arrays import Integers, Mask
 from tuning.auto.bench import BY_TRIAL
 from tuning.auto.loop_model import LinkedAxis, LoopModel, loop_models, measured_response, one_plant
 from tuning.auto.measured_margins import LOOPS, MeasuredAxis, at_least_by_model, why_unbounded
+from tuning.identify.working_state import switch_off
 from tuning.oscillation_watch import OscillationWatch
 from tuning.response.measured_loop import merged
 
@@ -53,8 +55,8 @@ FREE_WINDOW = 100  # turns; the following error is meaningless during a frequenc
 def measure(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mask) -> RecordedGains:
     """Measure the velocity loop's response of axes with their gains, and the slack of their loops to the dynamics.
 
-    Gains with which an axis oscillates by itself meanwhile fail; it gets calm gains once its current swings more than
-    its excitation can make it.
+    Gains with which an axis oscillates by itself meanwhile fail; where time waits it gets calm gains once its current
+    swings more than its excitation can make it.
     """
     going = where & bench.going & (recorded.failed == "")
     if bench.target.linked:
@@ -64,24 +66,8 @@ def measure(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mask
     going = bench.whole_machines(going & ~late)
     if not going.any():
         return recorded
-    from tuning.response import frequency_response
-
-    drives = bench.target.drives
-    # Trials ended anywhere in the travel: count the remaining travel from there.
-    low, high = bench.room()
-    noise = bench.target.device.stage["adc_noise"].high
-    watch = OscillationWatch(going, np.full(len(going), bench.target.current), noise, basis.calm)
-    here = replace(bench.target, drives=ObservedDrives(drives, watch), low=low, high=np.maximum(high, LEAST_WAY))
-    write_gains(drives, recorded.gains, going)
-    drives.write(cia402.FOLLOWING_WINDOW, FREE_WINDOW * drives.read(Role.POSITION_SCALE), where=going)
     try:
-        with bench.spending(going):
-            response = frequency_response.measure(here, "velocity", where=going)
-            if (longer := _unclear(bench, basis, recorded, response, going)).any():
-                again = frequency_response.measure(
-                    here, "velocity", where=longer, periods=LONGER * frequency_response.PERIODS
-                )
-                response = merged([response, again])
+        response = _respond(bench, basis, recorded, going)
     except SafetyError as error:
         bench.stop(going, f"the envelope stopped the frequency response: {error}")
         return recorded
@@ -89,8 +75,6 @@ def measure(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mask
         if isinstance(error, BusError):
             raise
         return _without_response(recorded, going, str(error))
-    finally:
-        bench.watch_following(going)
     bench.ground.begin_here(going)
     recorded = _without_oscillating(recorded, response, going)
     unseen, faults = recorded.unseen.copy(), bench.faults()
@@ -113,6 +97,34 @@ def measure(bench: AutoBench, basis: Basis, recorded: RecordedGains, where: Mask
     recorded = _with_slack(bench, basis, replace(recorded, response=response, unseen=unseen), going)
     bench.recover_faults(faults, "its frequency response was measured")
     return recorded
+
+
+def _respond(bench: AutoBench, basis: Basis, recorded: RecordedGains, going: Mask) -> MeasuredLoop:
+    """Excite axes with their gains and return their response; longer if it is unclear and drive time is left."""
+    from tuning.response import frequency_response
+
+    drives = bench.target.drives
+    # Trials ended anywhere in the travel: count the remaining travel from there.
+    low, high = bench.room()
+    noise = bench.target.device.stage["adc_noise"].high
+    watch = OscillationWatch(going, np.full(len(going), bench.target.current), noise, basis.calm)
+    # In real time the windows of the watch would interrupt the excitation.
+    watched = ObservedDrives(drives, watch) if drives.time_waits else drives
+    here = replace(bench.target, drives=watched, low=low, high=np.maximum(high, LEAST_WAY))
+    # In real time the envelope would stop an axis that gets no command while its response is evaluated.
+    off = None if drives.time_waits else partial(switch_off, drives, going)
+    write_gains(drives, recorded.gains, going)
+    drives.write(cia402.FOLLOWING_WINDOW, FREE_WINDOW * drives.read(Role.POSITION_SCALE), where=going)
+    try:
+        with bench.spending(going):
+            response = frequency_response.measure(here, "velocity", where=going, after_motion=off)
+            if (longer := _unclear(bench, basis, recorded, response, going)).any():
+                periods = LONGER * frequency_response.PERIODS
+                again = frequency_response.measure(here, "velocity", where=longer, periods=periods, after_motion=off)
+                response = merged([response, again])
+    finally:
+        bench.watch_following(going)
+    return response
 
 
 def _without_oscillating(recorded: RecordedGains, response: MeasuredLoop, where: Mask) -> RecordedGains:
